@@ -1,0 +1,506 @@
+"""Reads bags: ours, those of rosbag2 and of other writers, with or without metadata.yaml."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from curation_ros.bags.cdr import CdrDecoder
+from curation_ros.bags.definitions import full_type_name, parse_definition
+from curation_ros.bags.mcap_file import McapInfo, Message, TornFileError, read_info, walk
+from curation_ros.bags.recovery import custom_data_of
+from curation_ros.bags.yaml_text import load_yaml
+from curation_ros.core.builder import EpisodeBuilder
+from curation_ros.core.episode import Episode
+from curation_ros.core.errors import BagError, ConfigError, EpisodeError
+from curation_ros.core.identity import foreign_episode_id
+from curation_ros.core.status import EpisodeEvent, event_from_json, owner_findings
+from curation_ros.core.stream import Sample, header_stamp_ns
+from curation_ros.core.topic_map import TopicMap, topic_map_from_json
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """Type and number of messages of a topic."""
+
+    type: str
+    count: int
+
+
+class BagMessage(NamedTuple):
+    """A message of a bag; times are nanoseconds."""
+
+    topic: str
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Bag:
+    """A bag that was opened: what it holds; its messages are read when asked for.
+
+    Attributes:
+        path: what was opened: a folder or an .mcap file.
+        mcap_paths: its files in order.
+        topics: resolved name -> type and count, of messages in CDR with a ros2msg definition.
+        unreadable: resolved name -> why its messages cannot be read.
+        definitions: message type -> ros2msg text, as recorded.
+        custom_data: of rosbag2's metadata.
+        start_ns, end_ns: first and last log time; 0 without messages.
+    """
+
+    path: Path
+    mcap_paths: tuple[Path, ...]
+    topics: Mapping[str, BagTopic]
+    unreadable: Mapping[str, str]
+    definitions: Mapping[str, str]
+    custom_data: Mapping[str, str]
+    start_ns: int
+    end_ns: int
+    _infos: tuple[McapInfo, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the folder or, without its suffix, of the file."""
+        return self.path.stem if self.path.is_file() else self.path.resolve().name
+
+    @cached_property
+    def sha256(self) -> str:
+        """Digest of the first file, as 64 hexadecimal digits.
+
+        Raises:
+            BagError: if it cannot be read.
+        """
+        digest = hashlib.sha256()
+        try:
+            with self.mcap_paths[0].open("rb") as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+        except OSError as err:
+            raise BagError(f"{self.mcap_paths[0]}: {err.strerror}") from err
+        return digest.hexdigest()
+
+    def decoder(self) -> CdrDecoder:
+        """A decoder that knows the definitions of this bag."""
+        return CdrDecoder(self.definitions)
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+        """Messages in file order; chunks without a wanted topic are not unpacked.
+
+        Args:
+            topics: resolved names; None: all that are readable.
+
+        Raises:
+            BagError: if a topic cannot be read, or a file is truncated or damaged, after all
+                before the damage were yielded.
+        """
+        for topic in topics or ():
+            if topic in self.unreadable:
+                raise BagError(f"{self.path}: topic {topic}: {self.unreadable[topic]}")
+        wanted = self.topics if topics is None else set(topics) & set(self.topics)
+        for path, info in zip(self.mcap_paths, self._infos, strict=True):
+            names = {i: c.topic for i, c in info.channels.items() if c.topic in wanted}
+            chunks = info.chunk_channels
+
+            def skip(offset: int, names: dict[int, str] = names, chunks: Any = chunks) -> bool:
+                return offset in chunks and chunks[offset].isdisjoint(names)
+
+            for record in walk(path, skip, names.keys()) if names else ():
+                if isinstance(record, Message):
+                    yield BagMessage(names[record.channel_id], *record[2:4], record[1], record[4])
+
+    def resolve(self, topic_map: TopicMap) -> dict[str, str]:
+        """Find the topics of a map in this bag.
+
+        A topic is the one that our recorder noted for it, else `/<topic>`, else the one that ends
+        in `/<topic>` (among several: the one of the right type).
+
+        Returns:
+            Topic of the map -> resolved name; those that the bag lacks are absent.
+
+        Raises:
+            BagError: if a topic has another type than the map says, or several would do.
+        """
+        noted = self._json("topics")
+        names = {**{t: x.type for t, x in self.topics.items()}, **dict.fromkeys(self.unreadable)}
+        found: dict[str, str] = {}
+        for topic in topic_map.topics:
+            for name in (noted.get(topic), "/" + topic.lstrip("/")):
+                if isinstance(name, str) and name in names:
+                    found[topic] = name
+                    break
+        for topic, type_name in topic_map.topics.items():
+            if topic not in found:
+                taken = set(found.values())
+                ends = [n for n in names if n.endswith("/" + topic.lstrip("/")) and n not in taken]
+                fitting = [n for n in ends if names[n] == type_name] or ends
+                if len(fitting) > 1:
+                    raise BagError(
+                        f"{self.path}: topic {topic!r} may be {' or '.join(sorted(fitting))}; "
+                        "write the whole name into the topic map"
+                    )
+                if not fitting:
+                    continue
+                found[topic] = fitting[0]
+            name = found[topic]
+            if name in self.unreadable:
+                raise BagError(f"{self.path}: topic {name}: {self.unreadable[name]}")
+            if names[name] != type_name:
+                raise BagError(
+                    f"{self.path}: topic {name} has type {names[name]}, the topic map expects "
+                    f"{type_name}"
+                )
+        return found
+
+    def samples(self, topic_map: TopicMap) -> list[Sample]:
+        """All samples of the topics of a map, in file order.
+
+        Raises:
+            BagError: as `resolve` and `messages`, or where a type has no header although the map
+                takes its stamp from there.
+        """
+        resolved = self.resolve(topic_map)
+        decoder = self.decoder()
+        for topic in resolved:
+            type_name = topic_map.topics[topic]
+            if topic not in topic_map.source_stamped and not decoder.has_header(type_name):
+                raise BagError(
+                    f"{self.path}: topic {topic!r}: {type_name} has no header; "
+                    "write 'stamp: source' into the topic map"
+                )
+        by_name: dict[str, list[str]] = {}
+        for topic, name in resolved.items():
+            by_name.setdefault(name, []).append(topic)
+        out = []
+        for message in self.messages(by_name):
+            for topic in by_name[message.topic]:
+                try:
+                    stamp_ns = (
+                        message.publish_time_ns
+                        if topic in topic_map.source_stamped
+                        else header_stamp_ns(message.data)
+                    )
+                except EpisodeError as err:
+                    raise BagError(f"{self.path}: topic {message.topic}: {err}") from err
+                out.append(Sample(topic, stamp_ns, message.sequence, message.data))
+        return out
+
+    def event(self) -> EpisodeEvent | None:
+        """What the owner of the episode said; None for a bag that is not ours.
+
+        Raises:
+            BagError: if it is there and makes no sense.
+        """
+        if "episode" not in self.custom_data:
+            return None
+        try:
+            return event_from_json(self._json("episode"))
+        except EpisodeError as err:
+            raise BagError(f"{self.path}: {err}") from err
+
+    def topic_map(self) -> TopicMap | None:
+        """The topic map that our recorder stored; None for a bag that is not ours.
+
+        Raises:
+            BagError: if it is there and makes no sense.
+        """
+        if "topic_map" not in self.custom_data:
+            return None
+        try:
+            return topic_map_from_json(self._json("topic_map"), f"{self.path}: its topic map")
+        except ConfigError as err:
+            raise BagError(str(err)) from err
+
+    def _json(self, key: str) -> dict[str, Any]:
+        text = self.custom_data.get(key, "{}")
+        try:
+            raw = json.loads(text)
+        except ValueError:
+            raw = None
+        if not isinstance(raw, dict):
+            raise BagError(
+                f"{self.path}: custom_data {key!r} is {text[:40]!r}, expected a JSON object"
+            )
+        return raw
+
+
+def open_bag(path: Path) -> Bag:
+    """Open a bag.
+
+    Args:
+        path: folder of a bag, with or without metadata.yaml, or one .mcap file.
+
+    Raises:
+        BagError: if it is missing, truncated, of another storage or encoding, or compressed as a
+            whole, saying which and what to do.
+    """
+    custom_data: dict[str, str] | None = None
+    if path.is_dir():
+        metadata = _read_metadata_file(path)
+        mcap_paths = _listed_files(path, metadata) if metadata else _found_files(path)
+        if metadata is not None:
+            raw = metadata.get("custom_data") or {}
+            custom_data = {str(k): str(v) for k, v in raw.items()}
+    else:
+        mcap_paths = (path,)
+    infos = tuple(_checked_info(p) for p in mcap_paths)
+    topics: dict[str, BagTopic] = {}
+    unreadable: dict[str, str] = {}
+    definitions: dict[str, str] = {}
+    for file, info in zip(mcap_paths, infos, strict=True):
+        _collect_topics(file, info, topics, unreadable, definitions)
+    if not topics and unreadable:
+        name, reason = next(iter(unreadable.items()))
+        raise BagError(f"{path}: no topic can be read: {name}: {reason}")
+    if custom_data is None:
+        records = [info.rosbag2 for info in infos if info.rosbag2 is not None]
+        custom_data = custom_data_of(records[-1]) if records else {}
+    filled = [info for info in infos if info.counts]
+    return Bag(
+        path=path,
+        mcap_paths=mcap_paths,
+        topics=topics,
+        unreadable=unreadable,
+        definitions=definitions,
+        custom_data=custom_data,
+        start_ns=min((info.start_ns for info in filled), default=0),
+        end_ns=max((info.end_ns for info in filled), default=0),
+        _infos=infos,
+    )
+
+
+def _read_metadata_file(folder: Path) -> dict[str, Any] | None:
+    """Contents of metadata.yaml; None where it is missing or spoilt: the files say the same."""
+    path = folder / "metadata.yaml"
+    try:
+        raw = load_yaml(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except OSError as err:
+        raise BagError(f"{path}: {err.strerror}") from err
+    except ValueError:
+        return None
+    info = raw.get("rosbag2_bagfile_information") if isinstance(raw, dict) else None
+    if not isinstance(info, dict) or not isinstance(info.get("custom_data") or {}, dict):
+        return None
+    return info
+
+
+def _listed_files(folder: Path, metadata: Mapping[str, Any]) -> tuple[Path, ...]:
+    storage = metadata.get("storage_identifier", "mcap")
+    if storage not in ("mcap", ""):
+        raise BagError(
+            f"{folder}: storage {storage!r} cannot be read, expected mcap; convert it with "
+            "rosbags-convert or `ros2 bag convert`"
+        )
+    if metadata.get("compression_mode"):
+        raise BagError(
+            f"{folder}: compression mode {metadata['compression_mode']!r} cannot be read, "
+            "expected MCAP's own compression of chunks; convert it with rosbags-convert"
+        )
+    listed = metadata.get("relative_file_paths")
+    if not isinstance(listed, list) or not listed:
+        return _found_files(folder)
+    # Bags of old versions name their own folder, too; and none may point out of it.
+    files = tuple(folder / Path(str(name)).name for name in listed)
+    for file in files:
+        if not file.is_file():
+            raise BagError(f"{folder}: metadata.yaml names {file.name}, which is not there")
+    return files
+
+
+def _found_files(folder: Path) -> tuple[Path, ...]:
+    files = sorted(folder.glob("*.mcap"), key=_natural)
+    if len(files) == 1 or (files and _is_split(folder, files)):
+        return tuple(files)
+    if files:
+        raise BagError(
+            f"{folder} has {len(files)} .mcap files and no metadata.yaml: name one of them"
+        )
+    for pattern, what in (
+        ("*.db3", "SQLite files (.db3)"),
+        ("*.zstd", "compressed files (.zstd)"),
+    ):
+        if any(folder.glob(pattern)):
+            raise BagError(f"{folder} has {what}, expected .mcap; convert it with rosbags-convert")
+    raise BagError(f"{folder} is no bag: it has neither metadata.yaml nor an .mcap file")
+
+
+def _is_split(folder: Path, files: Sequence[Path]) -> bool:
+    """Whether files are the parts of one recording, as rosbag2 names them: <folder>_<number>."""
+    stem = re.escape(folder.resolve().name)
+    return all(re.fullmatch(rf"{stem}_\d+", file.stem) for file in files)
+
+
+def _natural(path: Path) -> tuple[tuple[int, str], ...]:
+    """Sort key under which part 10 follows part 9."""
+    pieces = re.findall(r"\d+|\D+", path.name)
+    return tuple((int(p), "") if p.isdigit() and p.isascii() else (-1, p) for p in pieces)
+
+
+def _checked_info(path: Path) -> McapInfo:
+    info = read_info(path)
+    if info.profile not in ("ros2", ""):
+        raise BagError(f"{path}: MCAP profile {info.profile!r}, expected 'ros2'")
+    return info
+
+
+def _collect_topics(
+    path: Path,
+    info: McapInfo,
+    topics: dict[str, BagTopic],
+    unreadable: dict[str, str],
+    definitions: dict[str, str],
+) -> None:
+    for channel in info.channels.values():
+        schema = info.schemas.get(channel.schema_id)
+        encoding = schema.encoding if schema is not None else ""
+        if schema is None or channel.message_encoding != "cdr" or encoding != "ros2msg":
+            unreadable[channel.topic] = (
+                f"messages in {channel.message_encoding!r} with a schema in {encoding!r}; "
+                "expected 'cdr' with 'ros2msg'"
+            )
+            continue
+        type_name = full_type_name(schema.name)
+        known = topics.get(channel.topic)
+        if known is not None and known.type != type_name:
+            raise BagError(
+                f"{path}: topic {channel.topic} has two types, {known.type} and {type_name}"
+            )
+        count = info.counts.get(channel.id, 0) + (known.count if known is not None else 0)
+        topics[channel.topic] = BagTopic(type_name, count)
+        text = schema.data.decode(errors="replace")
+        other = definitions.setdefault(type_name, text)
+        if other != text and parse_definition(type_name, other) != parse_definition(
+            type_name, text
+        ):
+            raise BagError(f"{path}: there are two different definitions of {type_name}")
+    strange = set(info.counts) - set(info.channels)
+    if strange:
+        raise TornFileError(path, f"messages of the unknown channel {min(strange)}")
+
+
+def read_episode(path: Path, topic_map: TopicMap | None = None) -> Episode:
+    """Build the episode of a bag, equal to the live one.
+
+    Args:
+        path: folder of a bag, or an .mcap file.
+        topic_map: which fields to build; None: the map that is stored in the bag.
+
+    Raises:
+        BagError: if the bag cannot be read, fits the map not, or has no map and none is given.
+        ConfigError: if a path of the map does not exist in its type.
+        EpisodeError: if the episode cannot be built.
+    """
+    return episode_of(open_bag(path), topic_map)
+
+
+def episode_of(bag: Bag, topic_map: TopicMap | None = None) -> Episode:
+    """Build the episode of a bag that is open; see `read_episode`."""
+    topic_map = topic_map or bag.topic_map()
+    if topic_map is None:
+        raise BagError(f"{bag.path} was not recorded by this package: give a topic map")
+    samples = bag.samples(topic_map)
+    event = episode_event(bag, topic_map, samples)
+    builder = EpisodeBuilder(
+        topic_map, bag.decoder(), episode_id=event.id, name=event.name, start_ns=event.start_ns
+    )
+    for sample in samples:
+        builder.push(sample)
+    end_ns = event.end_ns if event.end_ns is not None else event.start_ns
+    return builder.finish(end_ns, event.counts, owner_findings(event))
+
+
+def episode_event(bag: Bag, topic_map: TopicMap, samples: Sequence[Sample]) -> EpisodeEvent:
+    """The end of the bag's episode as its owner said it, or as its clock topic shows it.
+
+    Args:
+        bag: the bag.
+        topic_map: which topic is the clock.
+        samples: of that bag and map.
+
+    Returns:
+        An event that always has an end. Its reason notes that a bag was recovered, so that the
+        finding travels with a replay.
+
+    Raises:
+        BagError: if a bag that is not ours has nothing on its clock topic.
+    """
+    clock = [s.stamp_ns for s in samples if s.topic == topic_map.clock_topic]
+    event = bag.event()
+    if event is None:
+        if not clock:
+            raise BagError(
+                f"{bag.path}: no message of the clock topic {topic_map.clock_topic!r}; "
+                f"the bag has {', '.join(sorted(bag.topics)) or 'no topics'}"
+            )
+        start_ns = min(clock)
+        episode_id = foreign_episode_id(bag.sha256, start_ns)
+        event = EpisodeEvent(episode_id, bag.name, "ended", start_ns, max(clock))
+    if event.end_ns is None:  # the recorder died before it was said
+        event = replace(event, event="ended", end_ns=max([event.start_ns, *clock]))
+    if bag.custom_data.get("recovered") == "true":
+        tail = bag.custom_data.get("recovered_tail", "unknown")
+        line = f"recovered: recovered after its recorder died; reading stopped: {tail}"
+        event = replace(event, reason="\n".join(filter(None, [event.reason, line])))
+    return event
+
+
+def find_bags(paths: Iterable[Path]) -> list[Path]:
+    """Find the bags that a person means.
+
+    Args:
+        paths: .mcap files, bags, folders of bags or files, and datasets (their `episodes`);
+            what begins with a dot, such as `.partial`, is no bag.
+
+    Returns:
+        Paths for `open_bag`, in the order given, within a folder by name; none twice.
+
+    Raises:
+        BagError: for a path that does not exist or has no bag in it.
+    """
+    found: dict[Path, Path] = {}
+    for path in paths:
+        bags = _bags_in(path)
+        if not bags:
+            raise BagError(
+                f"{path} has no bag in it" if path.exists() else f"{path}: no such path"
+            )
+        for bag in bags:
+            found.setdefault(bag.resolve(), bag)
+    return list(found.values())
+
+
+def _bags_in(path: Path) -> list[Path]:
+    if path.is_file():
+        return [path]
+    if _is_bag(path):
+        return [path]
+    try:
+        folder = path / "episodes" if (path / "episodes").is_dir() else path
+        inside = sorted(folder.iterdir(), key=_natural) if folder.is_dir() else []
+    except OSError as err:
+        raise BagError(f"{path}: {err.strerror}") from err
+    return [
+        entry
+        for entry in inside
+        if not entry.name.startswith(".")
+        and (entry.suffix == ".mcap" if entry.is_file() else _is_bag(entry))
+    ]
+
+
+def _is_bag(folder: Path) -> bool:
+    if not folder.is_dir():
+        return False
+    if (folder / "metadata.yaml").is_file() or any(folder.glob("*.db3")):
+        return True
+    files = list(folder.glob("*.mcap"))
+    return len(files) == 1 or (bool(files) and _is_split(folder, files))

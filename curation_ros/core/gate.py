@@ -1,0 +1,172 @@
+"""The gate: which sample belongs to which episode, and when an episode has all of its samples.
+
+Shared by recorder and curator, so that both see the same episode.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from curation_ros.core.status import EpisodeEvent
+from curation_ros.core.stream import NS_PER_S, Sample
+
+
+@dataclass
+class Window:
+    """An episode that is open: what its owner said, and what has arrived of each topic."""
+
+    started: EpisodeEvent
+    ended: EpisodeEvent | None = None
+    deadline_s: float | None = None
+    stamps: dict[str, set[int]] = field(default_factory=dict)
+    latest_ns: dict[str, int] = field(default_factory=dict)
+
+    def holds(self, stamp_ns: int) -> bool:
+        """Whether a stamp lies in the window, as far as it is known."""
+        end = self.ended.end_ns if self.ended is not None else None
+        return self.started.start_ns <= stamp_ns and (end is None or stamp_ns <= end)
+
+    def counts(self) -> dict[str, int]:
+        """Distinct stamps of each topic in the window."""
+        return {
+            topic: sum(1 for stamp in stamps if self.holds(stamp))
+            for topic, stamps in self.stamps.items()
+        }
+
+    def missing(self, topics: Iterable[str]) -> list[str]:
+        """Topics that have neither passed the end stamp nor reached their count."""
+        if self.ended is None or self.ended.end_ns is None:
+            return list(topics)
+        arrived, expected = self.counts(), self.ended.counts
+        return [
+            topic
+            for topic in topics
+            if self.latest_ns.get(topic, -1) < self.ended.end_ns
+            and (topic not in expected or arrived.get(topic, 0) < expected[topic])
+        ]
+
+
+@dataclass(frozen=True)
+class Closed:
+    """An episode whose gate has closed.
+
+    Attributes:
+        event: the ended or aborted event.
+        counts: distinct stamps that arrived, by topic.
+        missing: topics that were still awaited when the drain time was over.
+    """
+
+    event: EpisodeEvent
+    counts: dict[str, int]
+    missing: tuple[str, ...]
+
+
+class EpisodeGate:
+    """Routes samples into episodes by their stamps.
+
+    A sample belongs to an episode iff start_stamp <= stamp <= end_stamp. Samples that arrive
+    before `started` wait in a buffer of `max_gap_s` of stamp time. An episode closes when every
+    topic has passed the end stamp or reached its count, else `drain_timeout_s` after `ended`.
+    Receive time is used for that timeout only.
+    """
+
+    def __init__(
+        self, topics: Iterable[str], *, max_gap_s: float = 0.25, drain_timeout_s: float = 3.0
+    ) -> None:
+        """Make a gate for these topics of the map.
+
+        Args:
+            topics: the mapped topics.
+            max_gap_s: stamp time that is buffered before an episode starts.
+            drain_timeout_s: patience after `ended`, seconds of the caller's clock.
+        """
+        self.topics = tuple(topics)
+        self.max_gap_s = max_gap_s
+        self.drain_timeout_s = drain_timeout_s
+        self._windows: dict[str, Window] = {}
+        self._closed: deque[tuple[EpisodeEvent, int]] = deque(maxlen=8)
+        self._before: dict[str, deque[Sample]] = {topic: deque() for topic in self.topics}
+
+    @property
+    def open_ids(self) -> tuple[str, ...]:
+        """Episodes that have started and not closed, oldest first."""
+        return tuple(self._windows)
+
+    def window(self, episode_id: str) -> Window | None:
+        """The open window of an episode, for display."""
+        return self._windows.get(episode_id)
+
+    def event(self, event: EpisodeEvent, now_s: float) -> list[Sample]:
+        """Take an event of the episode's owner.
+
+        Args:
+            event: as received; a repeated `started` (a latched topic) changes nothing, an end
+                without a start is ignored.
+            now_s: any monotonic clock.
+
+        Returns:
+            The buffered samples that belong to an episode that starts, in arrival order a topic.
+        """
+        if event.event == "started":
+            known = event.id in self._windows or any(e.id == event.id for e, _ in self._closed)
+            if known:
+                return []
+            window = Window(event)
+            self._windows[event.id] = window
+            early = [s for kept in self._before.values() for s in kept if window.holds(s.stamp_ns)]
+            for sample in early:
+                self._note(window, sample)
+            return early
+        open_window = self._windows.get(event.id)
+        if open_window is not None and open_window.ended is None:
+            open_window.ended = event
+            open_window.deadline_s = now_s + self.drain_timeout_s
+        return []
+
+    def push(self, sample: Sample) -> str | None:
+        """Take a sample; returns the id of the open episode it belongs to, if any.
+
+        Windows of one owner do not overlap; where they do, the younger episode gets the sample.
+        """
+        owner = None
+        for episode_id, window in reversed(self._windows.items()):
+            latest = window.latest_ns.get(sample.topic, -1)
+            window.latest_ns[sample.topic] = max(latest, sample.stamp_ns)
+            if owner is None and window.holds(sample.stamp_ns):
+                window.stamps.setdefault(sample.topic, set()).add(sample.stamp_ns)
+                owner = episode_id
+        before = self._before[sample.topic]
+        before.append(sample)
+        horizon = sample.stamp_ns - int(self.max_gap_s * NS_PER_S)
+        while before and (before[0].stamp_ns < horizon or before[0].stamp_ns > sample.stamp_ns):
+            before.popleft()
+        return owner
+
+    def late(self, sample: Sample) -> str | None:
+        """The closed episode that a sample came too late for, if any."""
+        for event, start_ns in self._closed:
+            if event.end_ns is not None and start_ns <= sample.stamp_ns <= event.end_ns:
+                return event.id
+        return None
+
+    def close_ready(self, now_s: float) -> list[Closed]:
+        """Close and return the episodes that are complete, aborted or out of time."""
+        done = []
+        for episode_id, window in list(self._windows.items()):
+            if window.ended is None or window.deadline_s is None:
+                continue
+            missing = window.missing(self.topics)
+            if window.ended.event != "aborted" and missing and now_s < window.deadline_s:
+                continue
+            del self._windows[episode_id]
+            self._closed.append((window.ended, window.started.start_ns))
+            done.append(Closed(window.ended, window.counts(), tuple(missing)))
+        return done
+
+    @staticmethod
+    def _note(window: Window, sample: Sample) -> None:
+        window.stamps.setdefault(sample.topic, set()).add(sample.stamp_ns)
+        latest = window.latest_ns.get(sample.topic, -1)
+        window.latest_ns[sample.topic] = max(latest, sample.stamp_ns)

@@ -1,0 +1,52 @@
+"""Identity of episodes: minted once, carried everywhere, never derived from a position."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterable
+
+from uuid6 import uuid7
+
+from curation_ros.core.errors import EpisodeError
+
+
+def new_episode_id() -> str:
+    """Mint a UUID version 7: unique anywhere, sortable by the time of its minting."""
+    return str(uuid7())
+
+
+def foreign_episode_id(sha256_hex: str, start_ns: int) -> str:
+    """Identity of an episode in a bag that we did not record.
+
+    Args:
+        sha256_hex: digest of the bag's first .mcap file.
+        start_ns: first stamp of the episode.
+
+    Returns:
+        A UUID version 5, the same on every machine for the same file.
+    """
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, f"sha256:{sha256_hex}:{start_ns}"))
+
+
+def resolve_prefix(prefix: str, names_by_id: Iterable[tuple[str, str]]) -> str:
+    """Find the one episode that a person means by a short name or the beginning of an id.
+
+    Args:
+        prefix: what was typed: a whole id, an unambiguous beginning of one, or a short name.
+        names_by_id: pairs (id, short name) of the known episodes.
+
+    Raises:
+        EpisodeError: if nothing or more than one episode fits.
+    """
+    pairs = list(names_by_id)
+    wanted = prefix.strip()
+    exact = {i for i, name in pairs if wanted in (i, name)}
+    found = exact or {i for i, _ in pairs if wanted and i.startswith(wanted.lower())}
+    if len(found) == 1:
+        return found.pop()
+    if not found:
+        raise EpisodeError(f"no episode has the id or name {prefix!r}; {len(pairs)} are known")
+    raise EpisodeError(
+        f"{prefix!r} means {len(found)} episodes ({', '.join(sorted(found)[:3])} ...): "
+        "type more characters of the id"
+    )

@@ -1,0 +1,89 @@
+"""Smoothness and gripper timing together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from curation_ros.core.errors import ConfigError, EpisodeError
+from curation_ros.core.scorers.gripper_timing import GripperTiming
+from curation_ros.core.scorers.scorer import Abstain, Need, Scorer
+from curation_ros.core.scorers.smoothness import Smoothness
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from curation_ros.core.episode import Episode
+    from curation_ros.core.stream import Floats
+
+
+class Ensemble(Scorer):
+    """Weighted sum of smoothness and gripper timing (the paper's 0.5 and 0.5).
+
+    The paper adds raw scores: smoothness (about -10 to -1.5) and timing (0 to 1) are of different
+    scales, so that with raw scores whichever varies more decides. `standardised=True` first
+    subtracts the mean and divides by the standard deviation of each in the reference, which it
+    then needs. Abstains where either part does.
+
+    Attributes:
+        mean_: (2,) mean of smoothness and timing in the reference; zeros if not standardised.
+        scale_: (2,) their standard deviation, at least their resolution; ones if not.
+    """
+
+    needs: Need = "nothing"
+    resolution = 0.05
+
+    def __init__(
+        self,
+        *,
+        smoothness_weight: float = 0.5,
+        gripper_weight: float = 0.5,
+        standardised: bool = False,
+    ) -> None:
+        """Store the weights, and whether the parts are standardised first."""
+        self.smoothness_weight = smoothness_weight
+        self.gripper_weight = gripper_weight
+        self.standardised = standardised
+        self.needs = "reference" if standardised else "nothing"
+
+    def check_params(self) -> None:
+        """Check the ranges."""
+        weights = (self.smoothness_weight, self.gripper_weight)
+        if not (np.isfinite(weights).all() and min(weights) >= 0 and sum(weights) > 0):
+            raise ConfigError(
+                "Ensemble: expected smoothness_weight and gripper_weight not negative and not "
+                f"both 0, found {weights}"
+            )
+
+    def fit(self, episodes: Sequence[Episode]) -> Self:
+        """Learn the scales of the parts, if they are standardised."""
+        self.check_params()
+        self.mean_, self.scale_ = np.zeros(2), np.ones(2)
+        if self.standardised:
+            try:
+                parts = np.array([self._parts(e) for e in episodes])
+            except Abstain as reason:
+                raise EpisodeError(f"a reference episode cannot be used: {reason}") from None
+            if len(parts) < 2:
+                raise EpisodeError(
+                    f"the reference has {len(parts)} episodes, at least 2 are needed"
+                )
+            self.mean_ = parts.mean(axis=0)
+            floor = [Smoothness.resolution, GripperTiming.resolution]
+            self.scale_ = np.maximum(parts.std(axis=0), floor)
+        return self
+
+    def score(self, episode: Episode) -> float:
+        """The weighted sum, without unit."""
+        self.check_params()
+        if self.standardised:
+            self._check_fitted()
+        parts = self._parts(episode)
+        if self.standardised:
+            parts = (parts - self.mean_) / self.scale_
+        return float(np.dot((self.smoothness_weight, self.gripper_weight), parts))
+
+    def _parts(self, episode: Episode) -> Floats:
+        return np.array([Smoothness().score(episode), GripperTiming().score(episode)])

@@ -1,0 +1,35 @@
+"""Spread of the action: what the paper calls entropy."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from curation_ros.core.scorers.features import moving_action
+from curation_ros.core.scorers.scorer import Scorer
+
+if TYPE_CHECKING:
+    from curation_ros.core.episode import Episode
+
+
+class Entropy(Scorer):
+    """Negative standard deviation of the action sequence (the paper's 'entropy').
+
+    The paper does not say over what: `over='dimensions'` averages the standard deviation over
+    time of each action dimension, `over='values'` takes one of all numbers together. A binary
+    gripper dominates either; `gripper_channel=False` leaves it out.
+    """
+
+    needs = "nothing"
+    resolution = 0.02
+    choices: ClassVar = {"over": ("dimensions", "values")}
+
+    def __init__(self, *, over: str = "dimensions", gripper_channel: bool = True) -> None:
+        """Store what is averaged, and whether the gripper counts."""
+        self.over = over
+        self.gripper_channel = gripper_channel
+
+    def score(self, episode: Episode) -> float:
+        """0 for no spread, more negative for more; in the unit of the action."""
+        self.check_params()
+        action = moving_action(episode, gripper_channel=self.gripper_channel)
+        return -float(action.std(axis=0).mean() if self.over == "dimensions" else action.std())

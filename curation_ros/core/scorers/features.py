@@ -1,0 +1,111 @@
+"""What scorers read from an episode, with the reason to abstain where it cannot be read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from curation_ros.core.errors import EpisodeError
+from curation_ros.core.scorers.scorer import Abstain
+
+if TYPE_CHECKING:
+    from curation_ros.core.episode import Episode
+    from curation_ros.core.stream import Floats
+
+
+def _columns(episode: Episode, names: tuple[str, ...], what: str) -> Floats:
+    if len(episode) < 2:
+        raise Abstain(f"too short: the episode has {len(episode)} steps")
+    if not names:
+        raise Abstain(f"the topic map declares no {what}")
+    missing = [n for n in names if n.partition("@")[0] not in episode.fields]
+    if missing:
+        raise Abstain(f"the {what} lacks the field {missing[0]!r}")
+    values = episode.columns(names)
+    if not np.isfinite(values).all():
+        raise Abstain(f"the {what} has values that are not finite")
+    return values
+
+
+def moving_action(episode: Episode, *, gripper_channel: bool = True) -> Floats:
+    """Actions of an episode in which something was commanded to move.
+
+    Args:
+        episode: any episode.
+        gripper_channel: whether the command of the gripper stays in.
+
+    Returns:
+        (T, A), T >= 2, finite, not the same row throughout.
+
+    Raises:
+        Abstain: if there are no such actions.
+    """
+    topic_map = episode.topic_map
+    names = topic_map.action
+    if not gripper_channel:
+        grippers = {spec.name for spec in topic_map.with_role("gripper")}
+        names = tuple(n for n in names if n.partition("@")[0] not in grippers)
+    values = _columns(episode, names, "action")
+    if (values == values[0]).all():
+        raise Abstain("the action never changes")
+    return values
+
+
+def finite_state(episode: Episode) -> Floats:
+    """(T, S) states, T >= 2, finite.
+
+    Raises:
+        Abstain: if there are no such states.
+    """
+    return _columns(episode, episode.topic_map.state, "state")
+
+
+def mean_std_rms(values: Floats) -> Floats:
+    """(3 D,) mean, standard deviation and root mean square of each column of (T, D)."""
+    rms = np.sqrt(np.mean(values**2, axis=0))
+    return np.concatenate([values.mean(axis=0), values.std(axis=0), rms])
+
+
+def reference_features(rows: Sequence[Floats], episodes: Sequence[Episode], least: int) -> Floats:
+    """Features of reference episodes as one table.
+
+    Args:
+        rows: one (F,) vector an episode.
+        episodes: the episodes, for messages.
+        least: smallest number of episodes that is of use.
+
+    Returns:
+        (n, F).
+
+    Raises:
+        EpisodeError: if there are too few, or their widths differ.
+    """
+    if len(rows) < least:
+        raise EpisodeError(f"the reference has {len(rows)} episodes, at least {least} are needed")
+    for row, episode in zip(rows, episodes, strict=True):
+        if len(row) != len(rows[0]):
+            raise EpisodeError(
+                f"reference episode {episode.id}: its state and action have other columns than "
+                f"those of {episodes[0].id}"
+            )
+    return np.array(rows)
+
+
+def check_width(found: int, expected: int, what: str) -> None:
+    """Refuse an episode of another robot than the reference's.
+
+    Raises:
+        Abstain: if the widths differ.
+    """
+    if found != expected:
+        raise Abstain(f"{what}: {found} values, the reference has {expected}")
+
+
+def phase_name(episode: Episode, step: int) -> str | None:
+    """Name of the phase at a step; None where it is unknown or the map has none."""
+    phase, labels = episode.phase, episode.phase_labels
+    if phase is None or not 0 <= phase[step] < len(labels):
+        return None
+    return labels[int(phase[step])]

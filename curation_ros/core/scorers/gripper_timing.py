@@ -1,0 +1,111 @@
+"""When the gripper opens again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from curation_ros.core import gripper
+from curation_ros.core.errors import EpisodeError
+from curation_ros.core.scorers.features import phase_name
+from curation_ros.core.scorers.scorer import Abstain, Scorer
+from curation_ros.core.stream import NS_PER_S
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from curation_ros.core.episode import Episode
+
+
+class GripperTiming(Scorer):
+    """Step of the first opening after a closing, over the number of steps (the paper's).
+
+    1.0 if it never opens again. `on='command'` reads the command, `on='fingers'` the measured
+    width (for hand-guided demonstrations without a command). Abstains if the gripper never
+    closed, and if the fingers contradict the sign that the topic map declares.
+
+    It needs no reference; one only completes its sentence for the operator.
+
+    Attributes:
+        earliest_opening_s_: earliest opening in the reference, seconds from the start; where none
+            opened, the end of the shortest one, until which all stayed closed.
+    """
+
+    needs = "nothing"
+    resolution = 0.05
+    choices: ClassVar = {"on": ("command", "fingers")}
+
+    def __init__(self, *, on: str = "command") -> None:
+        """Store what counts as an opening."""
+        self.on = on
+
+    def fit(self, episodes: Sequence[Episode]) -> Self:
+        """Learn when the reference opens; scores do not change."""
+        self.check_params()
+        opened, ended = [], []
+        for episode in episodes:
+            try:
+                step = self._opening(episode)
+            except Abstain:  # the rule that is fitted on our scores refuses it, by name
+                continue
+            ended.append(_seconds(episode, len(episode) - 1))
+            if step is not None:
+                opened.append(_seconds(episode, step))
+        self.earliest_opening_s_: float | None = min(opened or ended, default=None)
+        return self
+
+    def score(self, episode: Episode) -> float:
+        """From 0 (opened at once) to 1 (never opened again)."""
+        step = self._opening(episode)
+        return 1.0 if step is None else step / len(episode)
+
+    def location(self, episode: Episode) -> tuple[int, int] | None:
+        """The step of the opening."""
+        step = self._opening(episode)
+        return None if step is None else (step, step)
+
+    def explain(self, episode: Episode) -> str | None:
+        """When and in which phase it opened, and when the reference does."""
+        step = self._opening(episode)
+        if step is None:
+            return None
+        opened_s, phase = _seconds(episode, step), phase_name(episode, step)
+        text = f"the gripper opened at {opened_s:.1f} s" + (f", in {phase}" if phase else "")
+        earliest_s: float | None = getattr(self, "earliest_opening_s_", None)
+        if earliest_s is not None and opened_s < earliest_s:
+            text += f"; clean demonstrations open at {earliest_s:.1f} s or later"
+        return text
+
+    def _opening(self, episode: Episode) -> int | None:
+        self.check_params()
+        if len(episode) < 2:
+            raise Abstain(f"too short: the episode has {len(episode)} steps")
+        try:
+            if self.on == "command":
+                if not np.isfinite(gripper.gripper_command(episode)).all():
+                    raise Abstain("the gripper's command has values that are not finite")
+                inverted = gripper.contradiction(episode)
+                if inverted is not None:
+                    raise Abstain(inverted)
+                if not gripper.is_closed_command(episode).any():
+                    raise Abstain("the gripper was never commanded to close")
+                return gripper.first_opening(episode)
+            width = gripper.finger_width(episode)
+        except Abstain:
+            raise
+        except EpisodeError as err:
+            raise Abstain(str(err).partition(": ")[2]) from None
+        if width is None:
+            raise Abstain("the topic map declares no fingers")
+        if not np.isfinite(width).all():
+            raise Abstain("the fingers have values that are not finite")
+        closed = gripper.fingers_closed(episode)
+        if closed is None or not closed.any():
+            raise Abstain("the fingers never closed")
+        return gripper.first_finger_opening(episode)
+
+
+def _seconds(episode: Episode, step: int) -> float:
+    return (int(episode.stamps_ns[step]) - episode.start_ns) / NS_PER_S

