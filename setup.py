@@ -36,7 +36,7 @@ setup(
     ],
     install_requires=[
         "lz4",
-        "mcap>=1.2",
+        "mcap>=1.6",
         "numpy>=1.26",
         "pyyaml",
         "rich>=13",

@@ -72,8 +72,12 @@ def read_curation(config: Path | None, overrides: Mapping[str, Any]) -> Curation
         raise ConfigError(f"curation config {config}: {err}") from err
 
 
-def read_reference(paths: Sequence[Path], topic_map: TopicMap) -> list[Episode]:
-    """Read the reference demonstrations, with the map that the episodes to judge are built by.
+def read_reference(paths: Sequence[Path], topic_map: TopicMap | None) -> list[Episode]:
+    """Read the reference demonstrations.
+
+    Args:
+        paths: datasets or bags.
+        topic_map: the one that the episodes to judge are built by; None: that of each bag.
 
     Raises:
         CurationError: if one cannot be read, or there is none.

@@ -119,7 +119,9 @@ class LiveCuration:
         self._seen[episode.id] = episode
         while len(self._seen) > 8:
             del self._seen[next(iter(self._seen))]
-        decision = self._log(self.curation.decide(episode, revision=1, by=CURATOR))
+        decision = log_decision(
+            self.dataset, self.curation.decide(episode, revision=1, by=CURATOR)
+        )
         return Decided(decision, time.perf_counter() - began)
 
     def bag_closed(self, episode_id: str) -> Decision | None:
@@ -144,7 +146,7 @@ class LiveCuration:
                 return None
         decision = self.curation.decide(episode, revision=1, by=CURATOR)
         evidence = {**decision.evidence, "bag": "differs" if live is not None else "alone"}
-        return self._log(replace(decision, evidence=evidence))
+        return log_decision(self.dataset, replace(decision, evidence=evidence))
 
     def override(self, prefix: str, verdict: str, reason: str, by: str) -> Decision:
         """Log a person's decision.
@@ -160,18 +162,23 @@ class LiveCuration:
         """
         return override(self.dataset, prefix, verdict, reason, by, self.curation.state_hash)
 
-    def _log(self, decision: Decision) -> Decision:
-        """Log a decision of the curator, unless it says nothing new; returns the one in force."""
-        known = self.dataset.decisions(decision.episode)
-        own = [d for d in known if d.by == CURATOR]
-        if not own or not _says_the_same(own[-1], decision):
-            known.append(self.dataset.append_decision(decision))
-        return in_force(known)[decision.episode]
-
     def _amend(self, decision: Decision, evidence: Mapping[str, Any]) -> None:
         merged = {**decision.evidence, **evidence}
         if merged != decision.evidence:
             self.dataset.append_decision(replace(decision, evidence=merged), amend=True)
+
+
+def log_decision(dataset: Dataset, decision: Decision) -> Decision:
+    """Log a decision of the curator, unless it says nothing new.
+
+    Returns:
+        The decision in force: a person's, where a person has decided.
+    """
+    known = dataset.decisions(decision.episode)
+    own = [d for d in known if d.by == CURATOR]
+    if not own or not _says_the_same(own[-1], decision):
+        known.append(dataset.append_decision(decision))
+    return in_force(known)[decision.episode]
 
 
 def override(

@@ -336,5 +336,5 @@ def _index_decision(db: sqlite3.Connection, d: Decision) -> None:
 def _index_selection(db: sqlite3.Connection, manifest: Manifest, path: Path) -> None:
     db.execute(
         "INSERT OR REPLACE INTO selections VALUES (?,?,?,?,?)",
-        (manifest.name, str(path), manifest.created_at, len(manifest.entries), manifest.total),
+        (manifest.name, str(path), manifest.created_at, len(manifest.entries), manifest.kept_of),
     )

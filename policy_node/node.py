@@ -143,3 +143,7 @@ class PolicyNode(Node):
 def main() -> int:
     """Entry point of `ros2 run curation_ros policy_node`."""
     return run(PolicyNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -92,7 +92,7 @@ def train(
             cannot be used, their topic maps differ, or the loss is not finite (naming the step).
     """
     started_s = time.perf_counter()
-    _check_settings(steps, batch_size, lr, weight_decay, hidden, std_floor)
+    _check_settings(seed, steps, batch_size, lr, weight_decay, hidden, std_floor)
     chosen = _sorted(episodes)
     # Without phases the check says what is missing, and where.
     spec = ObservationSpec(variant, chosen[0][0].phase_labels or PHASES)
@@ -179,6 +179,7 @@ def normalisation(obs: Floats, spec: ObservationSpec, std_floor: float) -> tuple
 
 
 def _check_settings(
+    seed: int,
     steps: int,
     batch_size: int,
     lr: float,
@@ -196,8 +197,9 @@ def _check_settings(
     for name, number in (("lr", lr), ("std_floor", std_floor)):
         if not number > 0.0:
             raise PolicyError(f"training: {name} is {number}, expected more than 0")
-    if not weight_decay >= 0.0:
-        raise PolicyError(f"training: weight_decay is {weight_decay}, expected 0 or more")
+    for name, number in (("seed", seed), ("weight_decay", weight_decay)):
+        if not number >= 0:
+            raise PolicyError(f"training: {name} is {number}, expected 0 or more")
 
 
 def _sorted(episodes: Iterable[tuple[Episode, Span | None]]) -> list[tuple[Episode, Span | None]]:

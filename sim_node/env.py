@@ -262,7 +262,9 @@ class LiberoEnv:
         self._n_steps += 1
         reason = self._divergence()
         if reason is not None:
-            raise SimError(f"the simulation diverged in step {self._n_steps}: {reason}")
+            n = self._n_steps
+            place = f"step {n}" if n > 0 else f"settling step {n + N_SETTLE_STEPS}"
+            raise SimError(f"the simulation diverged in {place}: {reason}")
 
     def _divergence(self) -> str | None:
         # MuJoCo counts a warning and resets the state by itself, so the state alone tells nothing.

@@ -71,6 +71,7 @@ class _Running:
     plan: EpisodePlan
     start_ns: int
     controller: DefectiveController | None
+    tracker: PhaseTracker
     began_s: float = field(default_factory=time.monotonic)
     executed: int = 0
     success_step: int | None = None
@@ -84,6 +85,7 @@ class SimNode(Node):
         super().__init__("sim_node")
         self._p = p = declare(self, PARAMETERS)
         n = max(1, p["episodes"])
+        began_s = time.perf_counter()
         starts = parse_starts(p["starts"] or f"generated:{p['seed']}:{n}")
         self._starts = {start.name: start for start in starts}
         names = list(self._starts)
@@ -98,7 +100,8 @@ class SimNode(Node):
         dataset = Path(p["dataset"]).expanduser()
         self._dataset = Dataset(dataset, create=True) if p["dataset"] else None
         self._env = LiberoEnv(lean=p["lean"])
-        self.get_logger().info(f"LIBERO ready in {self._env.construct_s:.1f} s")
+        ready_s = time.perf_counter() - began_s
+        self.get_logger().info(f"LIBERO and {len(starts)} starts ready in {ready_s:.1f} s")
         self._out = SimPublishers(self, self._env, owner=p["episodes"] > 0, expert=self._expert)
         self._commands: dict[str, tuple[int, Any]] = {}
         self._commanded_s = 0.0
@@ -188,7 +191,9 @@ class SimNode(Node):
         self._stamp_ns += period_ns
         self._reset_wanted = False
         self._commands.clear()
-        self._running = r = _Running(new_episode_id(), name, plan, self._stamp_ns, controller)
+        self._running = r = _Running(
+            new_episode_id(), name, plan, self._stamp_ns, controller, tracker
+        )
         reason = "the sim node was stopped"
         try:
             self._out.event(EpisodeEvent(r.id, name, "started", r.start_ns))
@@ -299,6 +304,8 @@ class SimNode(Node):
                     "outcome": outcome,
                     "steps": r.executed,
                     "success_step": r.success_step,
+                    "stage": r.tracker.name,
+                    "aborted": reason,
                     "start": r.plan.start,
                     "repetition": r.plan.repetition,
                     "expert_seed": r.plan.expert_seed,
@@ -310,3 +317,7 @@ class SimNode(Node):
 def main() -> int:
     """Entry point of `ros2 run curation_ros sim_node`."""
     return run(SimNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -49,7 +49,6 @@ def _link_mujoco() -> None:
 
 def _compiled(signature: str) -> Callable[[Callable[..., Any]], Any]:
     """Numba's njit with a cache on disk where there is a place for one."""
-
     # A division by zero gives a NaN that the check for divergence finds, as everywhere in MuJoCo.
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 

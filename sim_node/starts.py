@@ -94,7 +94,7 @@ def official_start(index: int) -> Start:
     """
     if not 0 <= index < N_OFFICIAL:
         raise ConfigError(f"official starts are numbered 0 to {N_OFFICIAL - 1}, got {index}")
-    return Start(f"official-{index:02d}", official_states()[index].copy())
+    return Start(_official_name(index), official_states()[index].copy())
 
 
 def generated_start(seed: int, index: int, *, env: LiberoEnv | None = None) -> Start:
@@ -123,12 +123,12 @@ def generated_start(seed: int, index: int, *, env: LiberoEnv | None = None) -> S
             except SimError:
                 continue  # objects drawn into one another may explode
             if _is_acceptable(settled):
-                return Start(f"generated-{seed}-{index:03d}", state)
+                return Start(_generated_name(seed, index), state)
     raise SimError(f"none of {_MAX_ATTEMPTS} draws of start {index} of seed {seed} settles")
 
 
-def parse_starts(spec: str) -> list[Start]:
-    """The starts that a specification names.
+def start_names(spec: str) -> list[str]:
+    """Names of the starts that a specification means; nothing is simulated for it.
 
     Args:
         spec: `official:0:50` (first, end), `generated:0:24` (seed, count),
@@ -137,7 +137,7 @@ def parse_starts(spec: str) -> list[Start]:
     Raises:
         ConfigError: if the text is no such specification.
     """
-    starts: list[Start] = []
+    names: list[str] = []
     for part in spec.split(","):
         kind, *texts = part.strip().split(":")
         numbers = [int(text) for text in texts if re.fullmatch(r"[0-9]{1,9}", text)]
@@ -154,14 +154,25 @@ def parse_starts(spec: str) -> list[Start]:
         if first >= end:
             raise ConfigError(f"starts {spec!r}: {part.strip()!r} is empty; {_SPEC_HELP}")
         for index in range(first, end):
-            start = (
-                official_start(index) if kind == "official" else generated_start(numbers[0], index)
+            names.append(
+                _official_name(index) if kind == "official" else _generated_name(numbers[0], index)
             )
-            starts.append(start)
-    names = [start.name for start in starts]
     if len(set(names)) != len(names):
         raise ConfigError(f"starts {spec!r}: some start is named twice")
-    return starts
+    return names
+
+
+def parse_starts(spec: str) -> list[Start]:
+    """The starts that a specification means; see `start_names`."""
+    return [start_by_name(name) for name in start_names(spec)]
+
+
+def _official_name(index: int) -> str:
+    return f"official-{index:02d}"
+
+
+def _generated_name(seed: int, index: int) -> str:
+    return f"generated-{seed}-{index:03d}"
 
 
 def start_by_name(name: str) -> Start:

@@ -34,7 +34,7 @@ _NAME_LISTS = ("name", "joint_names")
 
 # Bytes that one vectorised pass copies at most, and layouts that are kept or tried.
 _BLOCK_BYTES = 16 << 20
-_MAX_LAYOUTS = 4
+_MAX_LAYOUTS = 8
 _MAX_CACHED = 512
 
 
@@ -273,9 +273,8 @@ class _Layout:
             (n,), dtype=code, buffer=block, offset=leaf.at, strides=(length,)
         )
         if leaf.code == "s":
-            return column.copy()
-        values = column != 0 if leaf.code == "?" else column
-        return np.asarray(values, dtype=np.float64)
+            return column
+        return (column != 0).astype(np.float64) if leaf.code == "?" else column.astype(np.float64)
 
 
 class CdrDecoder:
@@ -382,12 +381,10 @@ class CdrDecoder:
             self._layouts.clear()
         layouts = self._layouts.setdefault((type_name, tuple(p.text for p in paths), length), [])
         todo = np.array(rows)
-        data = np.empty((0, length), dtype=np.uint8)
-        if len(rows) > 1:
-            joined = b"".join([messages[row] for row in rows])
-            data = np.frombuffer(joined, dtype=np.uint8).reshape(len(rows), length)
+        joined = b"".join([messages[row] for row in rows])
+        data = np.frombuffer(joined, dtype=np.uint8).reshape(len(rows), length)
         tried = 0
-        while len(todo) > 1:
+        while len(todo):
             if tried == len(layouts):
                 if tried == _MAX_LAYOUTS:
                     break
@@ -398,8 +395,7 @@ class CdrDecoder:
             alike = layout.alike(data)
             if not alike.any():
                 continue
-            part = data if alike.all() else data[alike]
-            hit = todo[alike]
+            part, hit = (data, todo) if alike.all() else (data[alike], todo[alike])
             for k, leaf in enumerate(layout.leaves):
                 if k in numbers:
                     numbers[k][hit] = layout.column(part, leaf)

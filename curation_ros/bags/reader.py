@@ -20,7 +20,7 @@ from curation_ros.core.builder import EpisodeBuilder
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import BagError, ConfigError, EpisodeError
 from curation_ros.core.identity import foreign_episode_id
-from curation_ros.core.status import EpisodeEvent, event_from_json, owner_findings
+from curation_ros.core.status import EpisodeEvent, EventKind, event_from_json, owner_findings
 from curation_ros.core.stream import Sample, header_stamp_ns
 from curation_ros.core.topic_map import TopicMap, topic_map_from_json
 
@@ -446,7 +446,8 @@ def episode_event(bag: Bag, topic_map: TopicMap, samples: Sequence[Sample]) -> E
         episode_id = foreign_episode_id(bag.sha256, start_ns)
         event = EpisodeEvent(episode_id, bag.name, "ended", start_ns, max(clock))
     if event.end_ns is None:  # the recorder died before it was said
-        event = replace(event, event="ended", end_ns=max([event.start_ns, *clock]))
+        kind: EventKind = "aborted" if event.event == "aborted" else "ended"
+        event = replace(event, event=kind, end_ns=max([event.start_ns, *clock]))
     if bag.custom_data.get("recovered") == "true":
         tail = bag.custom_data.get("recovered_tail", "unknown")
         line = f"recovered: recovered after its recorder died; reading stopped: {tail}"

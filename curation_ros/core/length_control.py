@@ -53,7 +53,7 @@ class LengthControl:
             raise ConfigError(f"length control {mode!r}: value {value!r} is no number")
         if mode in ("none", "shortest-reference") and value is not None:
             raise ConfigError(f"length control {mode!r} takes no value, found {value!r}")
-        if mode == "fixed" and (value is None or value < 2 or value != int(value)):
+        if mode == "fixed" and (value is None or value < 2 or not float(value).is_integer()):
             raise ConfigError(f"length control 'fixed' takes steps, at least 2, found {value!r}")
         if mode == "percentile" and (value is None or not 0 <= value <= 100):
             raise ConfigError(f"length control 'percentile' takes 0 to 100, found {value!r}")

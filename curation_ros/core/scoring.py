@@ -134,6 +134,7 @@ class Curation:
                 deciding scorer cannot score, and why.
         """
         episodes = sorted(reference, key=lambda e: e.id)
+        vars(self).pop("state_hash_", None)  # a fit that fails leaves nothing to score with
         _check_reference(episodes)
         self.length_ = LengthControl(self.length, self.length_value)
         if self.length_.needs_reference and not episodes:

@@ -183,7 +183,7 @@ def _check_value(rule: str, value: float | None) -> None:
         "decisions": value is None,
         "all": value is None,
         "top-fraction": value is not None and 0 < value <= 1,
-        "top-k": value is not None and value >= 1 and value == int(value),
+        "top-k": value is not None and value >= 1 and float(value).is_integer(),
         "threshold": value is not None and math.isfinite(value),
     }
     if not good[rule]:
@@ -239,11 +239,6 @@ class Manifest:
         n_episodes = len({e.episode for e in self.entries})
         if n_episodes > self.kept_of:
             raise ConfigError(f"{where}: {n_episodes} episodes kept of {self.kept_of}")
-
-    @property
-    def total(self) -> int:
-        """Number of episodes chosen from; the same as `kept_of`."""
-        return self.kept_of
 
     def to_json(self) -> dict[str, Any]:
         """Plain data that `from_json` reads back to an equal manifest."""

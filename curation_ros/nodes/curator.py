@@ -175,3 +175,7 @@ class Curator(Node):
 def main() -> int:
     """Entry point of `ros2 run curation_ros curator`."""
     return run(Curator)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -200,3 +200,7 @@ class Recorder(Node):
 def main() -> int:
     """Entry point of `ros2 run curation_ros recorder`."""
     return run(Recorder)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -148,3 +148,7 @@ class Replay(Node):
 def main() -> int:
     """Entry point of `ros2 run curation_ros replay`."""
     return run(Replay)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

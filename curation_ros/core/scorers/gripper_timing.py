@@ -75,8 +75,8 @@ class GripperTiming(Scorer):
         text = f"the gripper opened at {opened_s:.1f} s" + (f", in {phase}" if phase else "")
         earliest_s: float | None = getattr(self, "earliest_opening_s_", None)
         if earliest_s is not None and opened_s < earliest_s:
-            text += f"; clean demonstrations open at {earliest_s:.1f} s or later"
-        return text
+            return f"{text}; clean demonstrations open at {earliest_s:.1f} s or later"
+        return f"{text}, after {step / len(episode):.0%} of {len(episode)} steps"
 
     def _opening(self, episode: Episode) -> int | None:
         self.check_params()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ ULPS = 1e-12
 
 
 def falling(scores: list[float]) -> bool:
-    return all(a > b for a, b in zip(scores, scores[1:], strict=False))
+    return all(a > b for a, b in pairwise(scores))
 
 
 # --- smoothness ---------------------------------------------------------------------------------
@@ -150,13 +151,17 @@ def test_gripper_timing_abstains_where_it_cannot_know(rng: np.random.Generator) 
 def test_gripper_timing_says_when_and_where(rng: np.random.Generator) -> None:
     early = make_episode(rng, open_at=140)
     scorer = GripperTiming()
-    assert scorer.explain(early) == "the gripper opened at 7.0 s, in LIFT"
+    assert scorer.explain(early) == (
+        "the gripper opened at 7.0 s, in LIFT, after 58% of 240 steps"
+    )
     scorer.fit([make_episode(rng, open_at=None), make_episode(rng)])
     assert scorer.explain(early) == (
         "the gripper opened at 7.0 s, in LIFT; clean demonstrations open at 11.9 s or later"
     )
     assert scorer.explain(make_episode(rng, open_at=None)) is None
-    assert scorer.explain(make_episode(rng)) == "the gripper opened at 11.9 s, in RELEASE"
+    assert scorer.explain(make_episode(rng)) == (
+        "the gripper opened at 11.9 s, in RELEASE, after 99% of 240 steps"
+    )
 
 
 # --- isolation forest ---------------------------------------------------------------------------
@@ -251,7 +256,9 @@ def test_knn_by_hand(rng: np.random.Generator) -> None:
     # at -1 and +1 of two features, 2 sqrt(2) apart.
     a = make_episode(rng)
     a = with_fields(a, eef_position=np.abs(a.fields["eef_position"]) * [0, 0, 0] + [1.0, 1, 1])
-    b = replace(a, id="b", fields={**a.fields, "eef_position": a.fields["eef_position"] + [2, 0, 0]})
+    b = replace(
+        a, id="b", fields={**a.fields, "eef_position": a.fields["eef_position"] + [2, 0, 0]}
+    )
     scorer = NearestNeighbours().fit([a, b])
     assert scorer.score(a) == pytest.approx(-2 * math.sqrt(2))
     assert scorer.score(replace(a, id="c")) == pytest.approx(-(0 + 2 * math.sqrt(2)) / 2)
@@ -295,9 +302,7 @@ def test_knn_is_not_decided_by_columns_that_the_reference_never_varied(
     rng: np.random.Generator,
 ) -> None:
     reference, episode = make_reference(rng), make_episode(rng)
-    flat = [
-        with_fields(e, bowl_position=np.full((len(e), 3), 0.9)) for e in (*reference, episode)
-    ]
+    flat = [with_fields(e, bowl_position=np.full((len(e), 3), 0.9)) for e in (*reference, episode)]
     off = with_fields(flat[-1], bowl_position=np.full((len(episode), 3), 0.9005))
     scorer = NearestNeighbours().fit(flat[:-1])
     assert scorer.score(off) == pytest.approx(scorer.score(flat[-1]), abs=0.5)
@@ -330,9 +335,7 @@ def test_alignment_falls_with_deviation(of: str, rng: np.random.Generator) -> No
     scorer = TrajectoryAlignment(of=of).fit(make_reference(rng))
     episode = make_episode(rng)
     scores = [
-        scorer.score(
-            with_fields(episode, eef_position=episode.fields["eef_position"] + [d, 0, 0])
-        )
+        scorer.score(with_fields(episode, eef_position=episode.fields["eef_position"] + [d, 0, 0]))
         for d in (0.0, 0.5, 1.5)
     ]
     assert falling(scores)

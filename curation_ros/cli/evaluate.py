@@ -1,0 +1,64 @@
+"""`curation evaluate`: how often a policy succeeds, in one process or over the graph."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from curation_ros.cli.output import console, percent, print_json
+from curation_ros.evaluating import evaluate_on_graph, summary
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("--policy", type=Path, required=True, help="folder of the policy")
+    parser.add_argument(
+        "--starts", default="official:0:50", help="official:FIRST:END or generated:SEED:COUNT"
+    )
+    parser.add_argument("--max-steps", type=int, default=500, help="then a rollout has failed")
+    parser.add_argument(
+        "--graph", action="store_true", help="drive sim_node and policy_node over ROS 2"
+    )
+    parser.add_argument("--logs", type=Path, help="with --graph: folder for the nodes' output")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print a row a rollout, then the summary."""
+    from policy_node.policy import Policy
+
+    policy = Policy.load(args.policy)
+    rows = []
+    for row in _rollouts(args, policy):
+        rows.append(row)
+        if args.json:
+            print_json(row)
+        else:
+            outcome = "success" if row["success"] else f"failed in {row['stage']}"
+            console.print(f"{row['start']}: {outcome} after {row['steps']} steps", markup=False)
+    total = summary(policy.id, rows)
+    if args.json:
+        print_json(total)
+    else:
+        interval = (total["ci95"][0], total["ci95"][1])
+        console.print(f"success {percent(total['successes'], total['rollouts'], interval)}")
+    return 0
+
+
+def _rollouts(args: argparse.Namespace, policy: Any) -> Iterator[dict[str, Any]]:
+    if args.graph:
+        logs = args.logs or Path(tempfile.mkdtemp(prefix="curation_ros-logs-"))
+        yield from evaluate_on_graph(
+            args.policy, policy.id, args.starts, max_steps=args.max_steps, log_folder=logs
+        )
+        return
+    from policy_node.rollouts import rollout
+    from sim_node.env import LiberoEnv
+    from sim_node.starts import start_by_name, start_names
+
+    names = start_names(args.starts)
+    with LiberoEnv() as env:
+        for name in names:
+            yield rollout(env, start_by_name(name), policy, args.max_steps).to_json()

@@ -1,0 +1,54 @@
+"""`curation index`: what a dataset holds; its index is a cache that can be made anew."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rich.table import Table
+
+from curation_ros.cli.output import VERDICT_STYLE, console, print_json, warn
+from curation_ros.core.stream import NS_PER_S
+from curation_ros.dataset import Dataset
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument(
+        "--rebuild", action="store_true", help="make the index anew from bags, logs and manifests"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Refresh or rebuild, then list the episodes with the decisions in force."""
+    dataset = Dataset(args.dataset)
+    for problem in dataset.rebuild() if args.rebuild else dataset.refresh():
+        warn(problem)
+    decided = dataset.latest_decisions()
+    table = Table("episode", "decision", "by", "seconds", "id", "reason", box=None, pad_edge=False)
+    for row in dataset.rows("SELECT * FROM episodes ORDER BY id"):
+        decision = decided.get(row["id"])
+        verdict = decision.verdict if decision is not None else None
+        by = decision.by if decision is not None else None
+        reason = decision.reason if decision is not None else ""
+        seconds = (row["end_ns"] - row["start_ns"]) / NS_PER_S
+        if args.json:
+            print_json(
+                {
+                    "episode": row["id"],
+                    "name": row["name"],
+                    "path": str(dataset.path / row["path"]),
+                    "decision": verdict,
+                    "by": by,
+                    "reason": reason,
+                    "recovered": bool(row["recovered"]),
+                }
+            )
+        else:
+            style = VERDICT_STYLE.get(verdict or "", "dim")
+            shown = f"[{style}]{verdict or 'undecided'}[/]"
+            table.add_row(row["name"], shown, by, f"{seconds:.1f}", row["id"], reason)
+    if not args.json:
+        console.print(table)
+    return 0

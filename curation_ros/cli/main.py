@@ -1,0 +1,79 @@
+"""The `curation` command."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from curation_ros import __version__
+from curation_ros.core.errors import ConfigError, CurationError
+
+#: Subcommand -> (module, one line of help). The only list; modules are imported when used, so
+#: that `curation score` needs no torch and `curation train` no ROS.
+COMMANDS = {
+    "score": ("curation_ros.cli.score", "score bags and decide on them, without ROS"),
+    "select": ("curation_ros.cli.select", "choose episodes and write a manifest"),
+    "override": ("curation_ros.cli.override", "a person's decision on an episode"),
+    "index": ("curation_ros.cli.index", "list a dataset; rebuild its index from its files"),
+    "record": ("curation_ros.cli.record", "start and stop a recorder that is driven by hand"),
+    "train": ("curation_ros.cli.train", "train a policy on a selection"),
+    "evaluate": ("curation_ros.cli.evaluate", "count a policy's successes over start states"),
+    "demo": ("curation_ros.cli.demo", "the whole path, from recording to the trained policy"),
+}
+DONE, FINDINGS, USAGE, NOTHING, FAULT = 0, 1, 2, 3, 70
+_INTERRUPTED = 130
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line, with the arguments of every subcommand."""
+    top = argparse.ArgumentParser(
+        prog="curation",
+        description="Curate robot demonstrations: score, decide, select, train, evaluate.",
+        epilog="Exit codes: 0 done, 1 findings (with --check), 2 usage, 3 nothing could be done, "
+        "70 a fault of ours.",
+    )
+    top.add_argument("--version", action="version", version=f"curation_ros {__version__}")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, (module, text) in COMMANDS.items():
+        command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:])
+        command.add_argument("--json", action="store_true", help="JSON lines on stdout, no tables")
+        importlib.import_module(module).add_arguments(command)
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one subcommand; a user never sees a traceback for bad input."""
+    args = parser().parse_args(argv)
+    try:
+        code: int = importlib.import_module(COMMANDS[args.command][0]).run(args)
+    except ConfigError as err:
+        return _complain(err, USAGE)
+    except CurationError as err:
+        return _complain(err, NOTHING)
+    except KeyboardInterrupt:
+        return _complain("interrupted", _INTERRUPTED)
+    except BrokenPipeError:  # the reader of our output has gone, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except ImportError as err:
+        return _complain(f"{args.command} needs {err.name}: install its extra", USAGE)
+    except Exception as err:
+        if os.environ.get("CURATION_TRACEBACK"):
+            raise
+        return _complain(
+            f"a fault of ours: {type(err).__name__}: {err} (CURATION_TRACEBACK=1 shows where)",
+            FAULT,
+        )
+    return code
+
+
+def _complain(problem: object, code: int) -> int:
+    print(f"error: {problem}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

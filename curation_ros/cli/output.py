@@ -1,0 +1,31 @@
+"""How commands print: JSON lines for programs, tables for people."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+
+#: For people. Progress and warnings go to stderr, so that stdout can be piped.
+console = Console(highlight=False)
+progress_console = Console(stderr=True, highlight=False)
+
+VERDICT_STYLE = {"keep": "green", "salvage": "cyan", "review": "yellow", "discard": "red"}
+
+
+def print_json(row: Mapping[str, Any]) -> None:
+    """One JSON line; null, never NaN."""
+    print(json.dumps(row, allow_nan=False), flush=True)
+
+
+def warn(problem: object) -> None:
+    """A line about something that did not stop us."""
+    progress_console.print(f"warning: {problem}", style="yellow", markup=False)
+
+
+def percent(successes: int, n: int, interval: tuple[float, float]) -> str:
+    """`7 of 10 (70 %, 95 % interval 40 to 89 %)`."""
+    low, high = interval
+    return f"{successes} of {n} ({successes / n:.0%}, 95 % interval {low:.0%} to {high:.0%})"

@@ -1,0 +1,42 @@
+"""`curation select`: from decisions or scores to a manifest, which is all that training reads."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from curation_ros.cli.output import console, print_json
+from curation_ros.core.selection import KEEP_RULES
+from curation_ros.dataset import Dataset
+from curation_ros.selecting import save_selection
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("dataset", type=Path)
+    rules = "; ".join(f"{name}: {text}" for name, text in KEEP_RULES.items())
+    parser.add_argument("--rule", choices=tuple(KEEP_RULES), default="decisions", help=rules)
+    parser.add_argument("--value", type=float, help="what the rule takes")
+    parser.add_argument("--scorer", default="", help="whose scores rank")
+    parser.add_argument("--name", default="", help="of the selection; default: rule and time")
+    parser.add_argument("--seed", type=int, default=0, help="of the order of equal scores")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the manifest."""
+    manifest, path = save_selection(
+        Dataset(args.dataset),
+        rule=args.rule,
+        value=args.value,
+        scorer=args.scorer,
+        name=args.name,
+        seed=args.seed,
+    )
+    kept = len(manifest.entries)
+    if args.json:
+        print_json({"manifest": str(path), "kept": kept, "of": manifest.kept_of})
+    else:
+        console.print(f"kept {kept} of {manifest.kept_of}: {path}", markup=False)
+        if manifest.abstained:
+            console.print(f"{len(manifest.abstained)} could not be judged and are not kept")
+    return 0

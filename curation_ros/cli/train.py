@@ -1,0 +1,64 @@
+"""`curation train`: a behaviour-cloning policy from a selection."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from pathlib import Path
+
+from rich.progress import Progress
+
+from curation_ros.cli.output import console, print_json, progress_console
+from curation_ros.core.errors import ConfigError
+from curation_ros.selecting import read_manifest, read_selected
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("--selection", type=Path, required=True, help="manifest to train on")
+    parser.add_argument("--seed", type=int, default=0, help="of weights and batches")
+    parser.add_argument("--steps", type=int, default=4000, help="gradient steps")
+    parser.add_argument(
+        "--variant",
+        default="relative",
+        help="observations: relative (no finger positions) or fingers (as the paper has them)",
+    )
+    parser.add_argument("--out", type=Path, help="folder of the policy; default: in the dataset")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train and save."""
+    from policy_node.train import train
+
+    manifest, dataset = read_manifest(args.selection)
+    if not manifest.entries:
+        raise ConfigError(f"selection {args.selection}: it keeps no episode: nothing to train on")
+    episodes = read_selected(manifest, dataset)
+    digest = hashlib.sha256(args.selection.read_bytes()).hexdigest()
+    with Progress(console=progress_console, transient=True, disable=args.json) as bar:
+        task = bar.add_task(f"training on {len(episodes)} episodes", total=args.steps)
+        trained = train(
+            episodes,
+            seed=args.seed,
+            steps=args.steps,
+            variant=args.variant,
+            selection=(manifest.name, digest),
+            progress=lambda step, _loss: bar.update(task, completed=step),
+        )
+    policy = trained.policy
+    folder = policy.save(args.out or dataset.path / "policies" / policy.id)
+    row = {
+        "policy": str(folder),
+        "loss": trained.loss,
+        "steps": policy.card.steps,
+        "seconds": trained.seconds,
+    }
+    if args.json:
+        print_json(row)
+    else:
+        console.print(
+            f"policy {folder}: loss {trained.loss:.4f} after {policy.card.steps} steps "
+            f"on {len(episodes)} episodes, {trained.seconds:.1f} s",
+            markup=False,
+        )
+    return 0

@@ -1,0 +1,68 @@
+"""Watches episodes and decisions on the graph, for whoever shows them."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Mapping
+from types import TracebackType
+
+import rclpy
+import rclpy.context
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+
+from curation_ros.core.status import EpisodeEvent, Status, event_from_status
+from curation_ros.nodes.messages import single_from_ros
+from curation_ros.nodes.qos import DECISIONS, LATCHED
+
+
+class Watcher:
+    """Collects what was said since the last look; use it in a `with` block.
+
+    Attributes:
+        events: of topic `episode`, oldest first.
+        decisions: of topic `curator/decision`, oldest first.
+    """
+
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        """Join the graph.
+
+        Args:
+            environment: ROS variables of the domain to watch; set for this process.
+        """
+        os.environ.update(environment)
+        self.events: deque[EpisodeEvent] = deque()
+        self.decisions: deque[Status] = deque()
+        self._context = rclpy.context.Context()
+
+    def __enter__(self) -> Watcher:
+        # Without signal handlers: Ctrl-C belongs to the program that watches.
+        rclpy.init(context=self._context)
+        self._node = rclpy.create_node("watcher", context=self._context)
+        self._node.create_subscription(DiagnosticArray, "episode", self._on_episode, LATCHED)
+        self._node.create_subscription(
+            DiagnosticArray, "curator/decision", self._on_decision, DECISIONS
+        )
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def look(self, seconds: float) -> None:
+        """Listen for a while."""
+        self._executor.spin_once(timeout_sec=seconds)
+
+    def _on_episode(self, message: DiagnosticArray) -> None:
+        self.events.append(event_from_status(single_from_ros(message)))
+
+    def _on_decision(self, message: DiagnosticArray) -> None:
+        self.decisions.append(single_from_ros(message))

@@ -1,0 +1,143 @@
+"""Meaning of the gripper: hold, both signs, both kinds, and the check against the fingers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from episodes import make_episode, topic_map, with_fields
+from hypothesis import given
+from hypothesis import strategies as st
+
+from curation_ros.core.episode import Episode
+from curation_ros.core.errors import EpisodeError
+from curation_ros.core.gripper import (
+    contradiction,
+    finger_width,
+    first_finger_opening,
+    first_opening,
+    gripper_findings,
+    is_closed_command,
+    is_open_command,
+)
+from curation_ros.core.topic_map import GripperSpec
+
+
+def commanded(*command: float, **spec: object) -> Episode:
+    """An episode with these commands, under the shipped map with `spec` changed."""
+    episode = make_episode(n_steps=len(command))
+    gripper = replace(topic_map().gripper or GripperSpec("gripper"), **spec)  # type: ignore[arg-type]
+    episode = with_fields(episode, gripper=np.array(command, dtype=float)[:, None])
+    return replace(episode, topic_map=replace(topic_map(), gripper=gripper))
+
+
+def test_zero_holds_the_previous_command() -> None:
+    episode = commanded(0, -1, 0, 0, 1, 0, -0.2, 0)
+    np.testing.assert_array_equal(is_open_command(episode), [0, 1, 1, 1, 0, 0, 1, 1])
+    np.testing.assert_array_equal(is_closed_command(episode), [0, 0, 0, 0, 1, 1, 0, 0])
+
+
+def test_sign_is_the_declared_one() -> None:
+    episode = commanded(-1, 1, -1, opens=1, open_value=1.0, closed_value=-1.0)
+    np.testing.assert_array_equal(is_open_command(episode), [0, 1, 0])
+
+
+def test_continuous_command_goes_to_the_nearer_end_and_the_middle_holds() -> None:
+    spec = {"kind": "continuous", "opens": 1, "open_value": 0.08, "closed_value": 0.0}
+    episode = commanded(0.08, 0.05, 0.04, 0.03, 0.04, 0.041, **spec)
+    np.testing.assert_array_equal(is_open_command(episode), [1, 1, 1, 0, 0, 1])
+
+
+def test_nan_holds() -> None:
+    np.testing.assert_array_equal(is_open_command(commanded(-1, np.nan, 1, np.nan)), [1, 1, 0, 0])
+
+
+def test_first_opening_wants_a_closing_before_it() -> None:
+    assert first_opening(commanded(-1, -1, 1, 1, -1, -1)) == 4
+    assert first_opening(commanded(-1, -1, 1, 1, 0, 0)) is None
+    assert first_opening(commanded(-1, -1, -1)) is None
+    assert first_opening(commanded(1, -1, 1, -1)) == 1
+    assert first_opening(make_episode(n_steps=0)) is None
+
+
+@given(st.lists(st.sampled_from([-1, 0, 1]), min_size=1, max_size=30))
+def test_first_opening_agrees_with_a_plain_loop(command: list[int]) -> None:
+    closed, expected = False, None
+    for step, value in enumerate(command):
+        closed = closed or value == 1
+        if closed and value == -1:
+            expected = step
+            break
+    assert first_opening(commanded(*command)) == expected
+
+
+def test_finger_width_of_two_one_and_mimic_columns() -> None:
+    episode = make_episode(n_steps=3)
+    two = with_fields(episode, finger_position=np.array([[0.04, -0.04], [0.01, 0.0], [0.0, 0.0]]))
+    np.testing.assert_allclose(finger_width(two), [0.08, 0.01, 0.0])
+    one = with_fields(episode, finger_position=np.array([[0.08], [0.01], [0.0]]))
+    np.testing.assert_allclose(finger_width(one), [0.08, 0.01, 0.0])
+    mimic = with_fields(episode, finger_position=np.array([[0.04, 0.04], [0.01, 0.01], [0, 0]]))
+    np.testing.assert_allclose(finger_width(mimic), [0.08, 0.02, 0.0])
+    assert finger_width(commanded(-1, 1, fingers="")) is None
+
+
+def test_fingers_follow_after_their_lag(rng: np.random.Generator) -> None:
+    assert first_finger_opening(make_episode(rng, open_at=140, finger_lag=3)) == 143
+    assert first_finger_opening(make_episode(rng, close_at=None)) is None
+
+
+@pytest.mark.parametrize("open_at", [-1, 140, None])
+@pytest.mark.parametrize("lag", [0, 2, 8])
+def test_right_sign_is_no_contradiction(
+    rng: np.random.Generator, open_at: int | None, lag: int
+) -> None:
+    assert contradiction(make_episode(rng, open_at=open_at, finger_lag=lag)) is None
+
+
+@pytest.mark.parametrize("open_at", [-1, 140, None])
+def test_inverted_sign_is_explained(rng: np.random.Generator, open_at: int | None) -> None:
+    text = contradiction(make_episode(rng, opens=1, open_at=open_at))
+    assert text is not None
+    assert "72 mm" in text
+    assert "(opens: -1) looks inverted" in text
+
+
+def test_inverted_sign_names_the_command_and_the_way(rng: np.random.Generator) -> None:
+    # Sent with +1 for open, the closing at step 95 reads as an opening; the fingers close.
+    assert contradiction(make_episode(rng, opens=1, open_at=None)) == (
+        "after an opening command the fingers moved together by 72 mm: the sign declared in the "
+        "topic map (opens: -1) looks inverted"
+    )
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0, 500.0])
+def test_contradiction_counts_time_not_steps(rng: np.random.Generator, rate_hz: float) -> None:
+    lag = int(0.3 * rate_hz)
+    episode = make_episode(rng, opens=1, rate_hz=rate_hz, finger_lag=lag, n_steps=600)
+    assert contradiction(episode) is not None
+
+
+def test_fingers_that_do_not_move_are_no_contradiction(rng: np.random.Generator) -> None:
+    episode = make_episode(rng, opens=1)
+    still = np.tile([0.02, -0.02], (len(episode), 1)) + 1e-4 * rng.standard_normal((240, 2))
+    assert contradiction(with_fields(episode, finger_position=still)) is None
+    nothing = with_fields(episode, finger_position=np.full((len(episode), 2), np.nan))
+    assert contradiction(nothing) is None
+
+
+def test_gripper_finding_spans_the_episode(rng: np.random.Generator) -> None:
+    episode = make_episode(rng, opens=1)
+    (finding,) = gripper_findings(episode)
+    assert finding.id == "gripper-meaning"
+    assert finding.span == (0, episode.end_ns - episode.start_ns)
+    assert gripper_findings(make_episode(rng)) == ()
+
+
+def test_map_without_gripper_raises_and_finds_nothing(rng: np.random.Generator) -> None:
+    episode = replace(make_episode(rng), topic_map=replace(topic_map(), gripper=None))
+    with pytest.raises(EpisodeError, match="no gripper"):
+        is_open_command(episode)
+    assert contradiction(episode) is None
+    assert gripper_findings(episode) == ()

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from demonstrations import TOPIC_MAP
+from test_policy import policy
+
+from curation_ros.core.phases import PHASES
+
+pytestmark = pytest.mark.sim
+pytest.importorskip("mujoco")
+pytest.importorskip("libero")
+
+MAX_STEPS = 12
+
+
+@pytest.fixture(scope="module")
+def env():
+    from sim_node.env import LiberoEnv
+
+    with LiberoEnv() as simulator:
+        yield simulator
+
+
+@pytest.fixture(scope="module")
+def start():
+    from sim_node.starts import generated_start
+
+    return generated_start(0, 0)
+
+
+def test_observations_become_fields_of_the_topic_map(env, start):
+    from policy_node.rollouts import field_values
+
+    values = field_values(env.reset(start.state))
+    for name, value in values.items():
+        assert value.shape == (len(TOPIC_MAP.fields[name].values),)
+    assert set(policy(variant="fingers").spec.fields) <= {*values, "phase"}
+    assert 0.8 < values["bowl_position"][2] < 1.0
+
+
+def test_rollout_is_bounded_and_repeats_exactly(env, start):
+    from policy_node.rollouts import evaluate, rollout
+
+    made = policy()
+    first = rollout(env, start, made, MAX_STEPS)
+    state = env.data.qpos.copy()
+    reported = []
+    again = evaluate(made, [start, start], env, MAX_STEPS, progress=reported.append)
+    assert again == reported == [first, first]
+    np.testing.assert_array_equal(env.data.qpos, state)
+    assert json.loads(json.dumps(first.to_json())) == {
+        "policy": made.id,
+        "start": start.name,
+        "success": False,
+        "steps": MAX_STEPS,
+        "stage": first.stage,
+    }
+    assert first.stage in PHASES
+
+
+def test_success_ends_the_rollout(env, start, monkeypatch):
+    from policy_node.rollouts import rollout
+
+    monkeypatch.setattr(env, "is_success", lambda: True)
+    done = rollout(env, start, policy(), MAX_STEPS)
+    assert (done.success, done.steps) == (True, 1)

