@@ -143,6 +143,7 @@ class Policy:
         card: what it is.
         spec: its observations.
         action: its commands.
+        arrays: weights and normalisation by name, as saved. Read only.
 
     Raises:
         PolicyError: if the card and the arrays do not fit together, or this version has other
@@ -172,7 +173,7 @@ class Policy:
         _check_arrays(arrays, shapes, where)
         if not (obs_std > 0.0).all():
             raise PolicyError(f"{where}: obs_std has a value that is not positive")
-        self._arrays = arrays
+        self.arrays = arrays
         self._obs_mean, self._obs_std = obs_mean.copy(), obs_std.copy()
         self._layers = [
             (np.ascontiguousarray(rows.T, dtype=np.float64), bias.astype(np.float64))
@@ -244,7 +245,7 @@ class Policy:
         folder = Path(folder)
         partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
         data = safetensors.numpy.save(
-            {name: np.ascontiguousarray(array) for name, array in self._arrays.items()}
+            {name: np.ascontiguousarray(array) for name, array in self.arrays.items()}
         )
         card = {
             "format": FORMAT,

@@ -13,6 +13,7 @@ import json
 import logging
 import platform
 import zipfile
+import zlib
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from typing import Any
@@ -32,6 +33,18 @@ _FORMAT = 1
 """Raised whenever what is stored changes its meaning."""
 
 _MODEL_NAME = "model.mjb"
+
+_UNREADABLE = (
+    OSError,
+    EOFError,
+    ValueError,
+    KeyError,
+    TypeError,
+    zipfile.BadZipFile,
+    zlib.error,
+    mujoco.FatalError,
+)
+"""What reading a damaged or foreign cache file raises."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +100,7 @@ def load_task() -> CompiledTask:
     if file.is_file():
         try:
             return _from_bytes(file.read_bytes())
-        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, mujoco.FatalError):
+        except _UNREADABLE:
             _LOGGER.warning("the cached task %s is unreadable: building it again", file)
     _LOGGER.info("compiling the task for the first time (about 15 s); it is cached in %s", file)
     content = _to_bytes(*compile_task(quiet_libero.build_stock_environment(FIXTURE_SEED)))

@@ -99,10 +99,19 @@ class SimPublishers:
             if event.event == "started":
                 self._episode.wait_for_all_acked(_ACKNOWLEDGED)
 
-    def outcome(self, status: Status, stamp_ns: int) -> None:
+    def outcome(self, status: Status) -> None:
         """Publish an outcome, for evaluation only."""
         if self._outcome is not None:
+            stamp_ns = self._node.get_clock().now().nanoseconds
             self._outcome.publish(array_to_ros([status], stamp_ns))
+
+    def several_commanders(self) -> str:
+        """Names of the nodes that command, if they are several or one has two publishers."""
+        infos = [i for t in COMMAND_TOPICS for i in self._node.get_publishers_info_by_topic(t)]
+        owners = {(i.node_namespace, i.node_name) for i in infos}
+        if len(owners) <= 1 and len(infos) <= len(COMMAND_TOPICS):
+            return ""
+        return " and ".join(sorted(name for _, name in owners)) + f" ({len(infos)} publishers)"
 
     def flush(self) -> None:
         """Wait until every subscriber has everything."""

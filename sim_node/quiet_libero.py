@@ -191,6 +191,8 @@ def _preload_robosuite_macros() -> None:
     macros.FILE_LOGGING_LEVEL = None
     macros.CONSOLE_LOGGING_LEVEL = "ERROR"
     macros.MUJOCO_GPU_RENDERING = False
+    # Its warnings are about macros; they would pass on to whatever handlers the process has.
+    logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
     sys.modules["robosuite.macros"] = macros
     try:
         import robosuite

@@ -98,7 +98,7 @@ def test_saved_policy_is_loaded_with_the_same_card_and_the_same_bits(folder):
 
 def test_output_is_the_written_formula():
     made = policy()
-    arrays = made._arrays
+    arrays = made.arrays
     obs = np.random.default_rng(2).normal(size=21)
     x = standardise(obs, arrays["obs_mean"], arrays["obs_std"])
     x = np.maximum(arrays["layer0.weight"] @ x + arrays["layer0.bias"], 0.0)

@@ -37,7 +37,7 @@ def quick(episodes, seed=0, **settings):
 
 
 def arrays(trained):
-    return trained.policy._arrays
+    return trained.policy.arrays
 
 
 def assert_same_bits(a, b):
