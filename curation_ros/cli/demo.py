@@ -11,16 +11,21 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from rich.console import Group
-from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.progress import TimeRemainingColumn as Remaining
-from rich.table import Table
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Column, Table
+from rich.text import Text
+from scipy.stats import fisher_exact
 
 from curation_ros.cli.output import VERDICT_STYLE, console, percent, print_json
 from curation_ros.core.errors import CurationError
@@ -35,6 +40,7 @@ _REFERENCE_SEED, _DEMONSTRATION_SEED, _TRAINING_SEED = 101, 7, 0
 _MAX_STEPS_DEFECTIVE = 350
 _START_UP_S = 120.0
 _CONDITIONS = ("everything", "kept")
+_SIGNIFICANT = 0.05
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -70,15 +76,6 @@ def run(args: argparse.Namespace) -> int:
         return 130
     demo.conclude(results, time.monotonic() - began_s)
     return 0
-
-
-@dataclass
-class _Seen:
-    """What the watcher has shown of one recording."""
-
-    ended: int = 0
-    running: str = ""
-    rows: list[Status] = field(default_factory=list)
 
 
 class _Demo:
@@ -150,24 +147,47 @@ class _Demo:
         n = parameters["episodes"]
         wait_for = ["recorder", *also, "watcher"]
         nodes.start("sim_node", {**parameters, "dataset": dataset, "wait_for": wait_for})
-        seen = _Seen()
-        bar = _progress()
-        task = bar.add_task(what, total=n)
-        shown = Group(_decisions([]), bar) if also else bar
-        with Live(shown, console=console, refresh_per_second=4, transient=False) as live:
-            while nodes.ended("sim_node") is None or (also and len(seen.rows) < n):
+        ended = 0
+        decided: set[str] = set()
+        with self._progress() as bar:
+            task = bar.add_task(f"{what}: starting the nodes", total=n)
+            while ended < n or (also and len(decided) < n):
                 nodes.check()
                 watcher.look(0.1)
-                _take(watcher, seen)
-                bar.update(task, completed=seen.ended, description=seen.running or what)
-                if also:
-                    live.update(Group(_decisions(seen.rows), bar))
-                if nodes.ended("sim_node") is not None and seen.ended >= n and not also:
-                    break
-            bar.update(task, completed=n, description=what)
+                while watcher.events:
+                    event = watcher.events.popleft()
+                    ended += event.event != "started"
+                    bar.update(task, completed=ended, description=f"recording {event.name}")
+                while watcher.decisions:
+                    decision = watcher.decisions.popleft()
+                    decided.add(decision.hardware_id)
+                    self._show(bar, decision)
+            bar.update(task, description="recorded")
+            nodes.wait("sim_node", _START_UP_S)
+
+    def _show(self, bar: Progress, decision: Status) -> None:
+        """One row of the live table, as the decision falls."""
         if self.args.json:
-            for row in seen.rows:
-                print_json({"episode": row.hardware_id, "name": row.name, **dict(row.values)})
+            print_json({"episode": decision.hardware_id, "name": decision.name, **decision.values})
+            return
+        row = Table.grid(Column(width=10), Column(width=8), Column(ratio=1), padding=(0, 2, 0, 0))
+        style = VERDICT_STYLE.get(decision.message, "")
+        row.add_row(
+            decision.name, Text(decision.message, style), Text(decision.values.get("reason", ""))
+        )
+        bar.console.print(row)
+
+    def _progress(self) -> Progress:
+        return Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=20),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=self.args.json,
+        )
 
     # --- selecting and training -------------------------------------------------------------
 
@@ -193,37 +213,34 @@ class _Demo:
         self.say(
             f"[bold]4. Training.[/] The same behaviour cloning on each: {steps} gradient steps."
         )
-        jobs = {}
-        bar = _progress()
-        with bar:
-            task = bar.add_task("training two policies", total=len(manifests))
+        jobs: dict[str, subprocess.Popen[str]] = {}
+        logs = {name: self.logs / f"train-{name}.log" for name in manifests}
+        with self._progress() as bar:
+            tasks = {name: bar.add_task(f"training on {name}", total=steps) for name in manifests}
             try:
                 for name, manifest in manifests.items():
                     command = [sys.executable, "-m", "curation_ros.cli.main", "train", "--json"]
                     command += ["--selection", str(manifest), "--seed", str(_TRAINING_SEED)]
-                    command += ["--steps", str(steps)]
+                    command += ["--steps", str(steps), "--report", str(logs[name])]
                     jobs[name] = subprocess.Popen(
-                        command,
-                        stdout=subprocess.PIPE,
-                        stderr=subprocess.PIPE,
-                        text=True,
-                        start_new_session=True,
+                        command, stdout=subprocess.PIPE, text=True, start_new_session=True
                     )
                 while any(job.poll() is None for job in jobs.values()):
-                    done = sum(job.poll() is not None for job in jobs.values())
-                    bar.update(task, completed=done)
+                    for name, task in tasks.items():
+                        bar.update(task, completed=_last_step(logs[name]))
                     time.sleep(0.1)
-                bar.update(task, completed=len(jobs))
             finally:
                 for job in jobs.values():
                     if job.poll() is None:
                         job.kill()
                         job.wait()
+            for task in tasks.values():
+                bar.update(task, completed=steps)
         policies = {}
         for name, job in jobs.items():
-            out, err = job.communicate()
+            out, _ = job.communicate()
             if job.returncode:
-                raise CurationError(f"training on {name}: {err.strip().splitlines()[-1]}")
+                raise CurationError(f"training on {name} ended with code {job.returncode}")
             policies[name] = Path(json.loads(out)["policy"])
         return policies
 
@@ -251,9 +268,8 @@ class _Demo:
 
         stop = threading.Event()
         threads = [threading.Thread(target=work, args=pair) for pair in policies.items()]
-        bar = _progress()
-        tasks = {name: bar.add_task(name, total=n) for name in policies}
-        with bar:
+        with self._progress() as bar:
+            tasks = {name: bar.add_task(f"trained on {name}", total=n) for name in policies}
             try:
                 for thread in threads:
                     thread.start()
@@ -302,42 +318,20 @@ class _Demo:
 
 def _verdict(everything: dict[str, Any], kept: dict[str, Any]) -> str:
     """What two counts say, in words that claim no more than they can."""
-    if kept["ci95"][0] > everything["ci95"][1]:
-        return "The kept demonstrations make the better policy; the intervals do not overlap."
-    if kept["ci95"][1] < everything["ci95"][0]:
-        return "The kept demonstrations make the WORSE policy: curation did harm here."
-    return (
-        "The intervals overlap: these few rollouts of one training seed do not show that "
-        "curation helped."
-    )
+    counts = [[r["successes"], r["rollouts"] - r["successes"]] for r in (kept, everything)]
+    p = float(fisher_exact(counts).pvalue)
+    chance = f"p = {p:.2g}, Fisher's exact test; one training seed each"
+    if p < _SIGNIFICANT:
+        better = kept["rate"] > everything["rate"]
+        which = "better" if better else "WORSE: curation did harm here"
+        return f"The policy trained on the kept demonstrations is {which} ({chance})."
+    return f"No difference is shown: so few rollouts can fall out like this by chance ({chance})."
 
 
-def _take(watcher: Any, seen: _Seen) -> None:
-    """Move what the watcher has into what is shown."""
-    while watcher.events:
-        event = watcher.events.popleft()
-        seen.ended += event.event != "started"
-        seen.running = f"recording {event.name}" if event.event == "started" else seen.running
-    while watcher.decisions:
-        status = watcher.decisions.popleft()
-        seen.rows = [r for r in seen.rows if r.hardware_id != status.hardware_id] + [status]
-
-
-def _decisions(rows: list[Status]) -> Table:
-    table = Table("demonstration", "decision", "reason", box=None, pad_edge=False)
-    for row in sorted(rows, key=lambda r: r.name):
-        style = VERDICT_STYLE.get(row.message, "")
-        table.add_row(row.name, f"[{style}]{row.message}[/]", row.values.get("reason", ""))
-    return table
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=30),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        Remaining(elapsed_when_finished=False),
-        console=console,
-    )
+def _last_step(log: Path) -> int:
+    """The step that a training has written last."""
+    try:
+        lines = log.read_text().split()
+    except OSError:
+        return 0
+    return int(lines[-1]) if lines else 0

@@ -23,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="relative",
         help="observations: relative (no finger positions) or fingers (as the paper has them)",
     )
+    parser.add_argument("--report", type=Path, help="file that gets a line of steps now and then")
     parser.add_argument("--out", type=Path, help="folder of the policy; default: in the dataset")
 
 
@@ -35,15 +36,22 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"selection {args.selection}: it keeps no episode: nothing to train on")
     episodes = read_selected(manifest, dataset)
     digest = hashlib.sha256(args.selection.read_bytes()).hexdigest()
+    report = args.report.open("w", buffering=1) if args.report else None
     with Progress(console=progress_console, transient=True, disable=args.json) as bar:
         task = bar.add_task(f"training on {len(episodes)} episodes", total=args.steps)
+
+        def show(step: int, _loss: float) -> None:
+            bar.update(task, completed=step)
+            if report is not None:
+                report.write(f"{step}\n")
+
         trained = train(
             episodes,
             seed=args.seed,
             steps=args.steps,
             variant=args.variant,
             selection=(manifest.name, digest),
-            progress=lambda step, _loss: bar.update(task, completed=step),
+            progress=show,
         )
     policy = trained.policy
     folder = policy.save(args.out or dataset.path / "policies" / policy.id)
