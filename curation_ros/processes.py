@@ -118,18 +118,28 @@ class Nodes:
         for key in reversed(list(self._running)):
             self.stop(key)
 
-    def start(self, node: str, parameters: Mapping[str, Any], *, key: str = "") -> None:
+    def start(
+        self,
+        node: str,
+        parameters: Mapping[str, Any],
+        *,
+        key: str = "",
+        remaps: Mapping[str, str] | None = None,
+    ) -> None:
         """Start a node.
 
         Args:
             node: one of NODE_MODULES.
             parameters: values of its parameters.
             key: name of the process and its log, where a node runs twice.
+            remaps: ROS names and what they become; `__ns` is the namespace.
         """
         key = key or node
         arguments = [sys.executable, "-m", NODE_MODULES[node], "--ros-args"]
         for name, value in parameters.items():
             arguments += ["-p", f"{name}:={_yaml(value)}"]
+        for name, value in (remaps or {}).items():
+            arguments += ["-r", f"{name}:={value}"]
         log = (self._logs / f"{key}.log").open("ab")
         process = subprocess.Popen(
             arguments,
@@ -141,6 +151,10 @@ class Nodes:
             preexec_fn=_die_with_parent,
         )
         self._running[key] = (process, log)
+
+    def send(self, key: str, number: signal.Signals) -> None:
+        """Send a signal to a process."""
+        self._running[key][0].send_signal(number)
 
     def ended(self, key: str) -> int | None:
         """Exit code of a process, None while it runs."""

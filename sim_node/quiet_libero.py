@@ -16,6 +16,7 @@ import os
 import sys
 import tempfile
 import threading
+import types
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -103,6 +104,7 @@ def import_libero() -> Any:
         _point_libero_at_our_configuration()
         try:
             with _headless(), _silenced():
+                _stand_in_for_opencv()
                 _preload_robosuite_macros()
                 from libero.libero.envs import env_wrapper
         except ImportError as error:
@@ -200,6 +202,18 @@ def _preload_robosuite_macros() -> None:
         sys.modules.pop("robosuite.macros", None)
         raise
     robosuite.macros = macros
+
+
+def _stand_in_for_opencv() -> None:
+    """Let an empty module pass for OpenCV where that cannot be loaded.
+
+    Its wheel needs libGL of the system, which a machine without a screen may lack; LIBERO and
+    robosuite import it for windows and pictures only, which are not made here.
+    """
+    try:
+        importlib.import_module("cv2")
+    except ImportError:
+        sys.modules["cv2"] = types.ModuleType("cv2")
 
 
 @contextlib.contextmanager

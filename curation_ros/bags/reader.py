@@ -463,7 +463,8 @@ def find_bags(paths: Iterable[Path]) -> list[Path]:
             what begins with a dot, such as `.partial`, is no bag.
 
     Returns:
-        Paths for `open_bag`, in the order given, within a folder by name; none twice.
+        Paths for `open_bag`, in the order given; within a dataset in that of the recording,
+        within another folder by name; none twice.
 
     Raises:
         BagError: for a path that does not exist or has no bag in it.
@@ -486,8 +487,11 @@ def _bags_in(path: Path) -> list[Path]:
     if _is_bag(path):
         return [path]
     try:
-        folder = path / "episodes" if (path / "episodes").is_dir() else path
-        inside = sorted(folder.iterdir(), key=_natural) if folder.is_dir() else []
+        is_dataset = (path / "episodes").is_dir()
+        folder = path / "episodes" if is_dataset else path
+        inside = sorted(folder.iterdir()) if folder.is_dir() else []
+        if not is_dataset:  # there names are ids, whose plain order is that of the recording
+            inside.sort(key=_natural)
     except OSError as err:
         raise BagError(f"{path}: {err.strerror}") from err
     return [

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from rich.table import Table
+from rich.text import Text
 
 from curation_ros.cli.output import VERDICT_STYLE, console, print_json, warn
 from curation_ros.core.stream import NS_PER_S
@@ -26,7 +27,11 @@ def run(args: argparse.Namespace) -> int:
     for problem in dataset.rebuild() if args.rebuild else dataset.refresh():
         warn(problem)
     decided = dataset.latest_decisions()
-    table = Table("episode", "decision", "by", "seconds", "id", "reason", box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False)
+    for heading in ("episode", "decision", "by"):
+        table.add_column(heading, no_wrap=True)
+    table.add_column("seconds", justify="right")
+    table.add_column("reason", ratio=1)
     for row in dataset.rows("SELECT * FROM episodes ORDER BY id"):
         decision = decided.get(row["id"])
         verdict = decision.verdict if decision is not None else None
@@ -46,9 +51,8 @@ def run(args: argparse.Namespace) -> int:
                 }
             )
         else:
-            style = VERDICT_STYLE.get(verdict or "", "dim")
-            shown = f"[{style}]{verdict or 'undecided'}[/]"
-            table.add_row(row["name"], shown, by, f"{seconds:.1f}", row["id"], reason)
+            shown = Text(verdict or "undecided", VERDICT_STYLE.get(verdict or "", "dim"))
+            table.add_row(row["name"], shown, by or "", f"{seconds:.1f}", Text(reason))
     if not args.json:
         console.print(table)
     return 0

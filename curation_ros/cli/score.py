@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.progress import track
 from rich.table import Table
+from rich.text import Text
 
 from curation_ros.bags.reader import find_bags, read_episode
 from curation_ros.cli.output import VERDICT_STYLE, console, print_json, progress_console, warn
@@ -23,6 +24,7 @@ from curation_ros.curating import log_decision
 from curation_ros.dataset import Dataset
 
 _DONE, _FINDINGS, _NOTHING = 0, 1, 3
+_FIXED_WIDTH, _SCORE_WIDTH = 64, 12
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.json:
         for line in curation.describe().splitlines():
             progress_console.print(line, style="dim", markup=False)
-        console.print(_table(rows))
+        console.print(_table(rows, curation))
     if not rows:
         return _NOTHING
     return _FINDINGS if args.check and flawed else _DONE
@@ -130,21 +132,25 @@ def decision_row(path: Path, episode: Episode, decision: Decision) -> dict[str, 
     }
 
 
-def _table(rows: list[dict[str, Any]]) -> Table:
-    scorers = list(rows[0]["scores"]) if rows else []
+def _table(rows: list[dict[str, Any]], curation: Curation) -> Table:
+    """All scores where the terminal is wide enough, else the one that decides."""
+    scorers = list(curation.scorers)
+    if console.width < _FIXED_WIDTH + _SCORE_WIDTH * len(scorers):
+        scorers = [curation.rule_scorer]
+        progress_console.print("a wider terminal, or --json, shows all scores", style="dim")
     table = Table(box=None, pad_edge=False)
-    for heading in ("episode", "decision", "steps", *(s.replace("_", " ") for s in scorers)):
-        table.add_column(
-            heading, justify="left" if heading in ("episode", "decision") else "right"
-        )
+    table.add_column("episode", no_wrap=True)
+    table.add_column("decision", no_wrap=True)
+    for heading in ("steps", *(s.replace("_", " ") for s in scorers)):
+        table.add_column(heading, justify="right")
     table.add_column("reason", ratio=1)
     for row in rows:
         scores = [row["scores"][s] for s in scorers]
         table.add_row(
             row["name"] or row["episode"][:8],
-            f"[{VERDICT_STYLE[row['decision']]}]{row['decision']}[/]",
+            Text(row["decision"], VERDICT_STYLE[row["decision"]]),
             str(row["length"]),
             *("-" if v is None else f"{v:.3g}" for v in scores),
-            row["reason"],
+            Text(row["reason"]),
         )
     return table

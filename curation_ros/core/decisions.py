@@ -356,7 +356,7 @@ class Threshold(Rule):
         if not keep and self.scorer in words:
             return "discard", words[self.scorer]
         shown, limit = _told_apart(score, threshold)
-        relation = "not below" if keep else "below"
+        relation = "at or above" if keep else "below"
         text = f"{self.scorer} {shown} {relation} {limit}, {origin}"
         return ("keep" if keep else "discard"), text
 

@@ -87,7 +87,7 @@ def test_threshold_needs_three_finite_references() -> None:
 def test_given_threshold_needs_nothing_and_is_inclusive() -> None:
     rule = Threshold(scorer="s", threshold=0.5)
     assert rule.needs == "nothing"
-    assert rule.judge({"s": 0.5}, {}, {}) == ("keep", "s 0.50 not below 0.50, as configured")
+    assert rule.judge({"s": 0.5}, {}, {}) == ("keep", "s 0.50 at or above 0.50, as configured")
     assert rule.judge({"s": 0.49}, {}, {}) == ("discard", "s 0.49 below 0.50, as configured")
 
 
@@ -101,7 +101,7 @@ def test_reason_shows_enough_digits_and_prefers_the_scorers_words() -> None:
     assert close == "s 0.49999 below 0.50000, as configured"
     words = {"smoothness": "the arm shook", "other": "no"}
     assert rule.judge({"smoothness": -9.0}, {}, words)[1] == "the arm shook"
-    assert "not below" in rule.judge({"smoothness": -1.0}, {}, words)[1]
+    assert "at or above" in rule.judge({"smoothness": -1.0}, {}, words)[1]
 
 
 def test_abstained_scorer_leads_to_review_with_its_reason() -> None:

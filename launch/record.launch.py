@@ -1,0 +1,100 @@
+"""Demonstrations recorded and judged as they come: by the simulated expert, or of your robot.
+
+ros2 launch curation_ros record.launch.py episodes:=10 contamination:=0.5
+ros2 launch curation_ros record.launch.py sim:=false topic_map:=my_robot.yaml
+"""
+
+from launch import LaunchDescription
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    LogInfo,
+    RegisterEventHandler,
+    TimerAction,
+)
+from launch.conditions import IfCondition
+from launch.event_handlers import OnProcessExit
+from launch.events import Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+# The curator may wait this long for late samples (its drain_timeout_s) before it decides.
+_LAST_DECISION_S = 4.0
+
+ARGUMENTS = (
+    ("dataset", "dataset", "folder of the dataset; made where it does not exist"),
+    ("reference", "", "dataset or bag of trusted demonstrations; empty: every verdict is review"),
+    ("config", "", "YAML file of scorers and rule; empty: config/curation.yaml"),
+    ("topic_map", "", "YAML file of the topic map; empty: the LIBERO robot of sim_node"),
+    ("sim", "true", "false: your robot publishes; start episodes by curation record"),
+    ("episodes", "10", "how many demonstrations the expert gives"),
+    ("contamination", "0.0", "fraction of them that are defective"),
+    ("defect", "early_release", "what is wrong with those"),
+    ("seed", "0", "of start states, order and defects"),
+)
+
+
+def generate_launch_description() -> LaunchDescription:
+    def text(name):
+        return ParameterValue(LaunchConfiguration(name), value_type=str)
+
+    def number(name, kind):
+        return ParameterValue(LaunchConfiguration(name), value_type=kind)
+
+    with_sim = LaunchConfiguration("sim")
+    common = {"dataset": text("dataset")}
+    judged = {**common, "topic_map": text("topic_map")}
+    recorder = Node(
+        package="curation_ros",
+        executable="recorder",
+        output="screen",
+        parameters=[{**judged, "auto": number("sim", bool)}],
+    )
+    curator = Node(
+        package="curation_ros",
+        executable="curator",
+        output="screen",
+        parameters=[
+            {
+                **judged,
+                "config": text("config"),
+                "reference": ParameterValue(["[", LaunchConfiguration("reference"), "]"]),
+            }
+        ],
+    )
+    sim = Node(
+        package="curation_ros",
+        executable="sim_node",
+        output="screen",
+        condition=IfCondition(with_sim),
+        parameters=[
+            {
+                **common,
+                "episodes": number("episodes", int),
+                "contamination": number("contamination", float),
+                "defect": text("defect"),
+                "seed": number("seed", int),
+                "wait_for": ["recorder", "curator"],
+            }
+        ],
+    )
+    recorded = [
+        LogInfo(msg="sim_node has ended; recorder and curator follow"),
+        TimerAction(
+            period=_LAST_DECISION_S,
+            actions=[EmitEvent(event=Shutdown(reason="all demonstrations are recorded"))],
+        ),
+    ]
+    return LaunchDescription(
+        [
+            *(
+                DeclareLaunchArgument(name, default_value=default, description=description)
+                for name, default, description in ARGUMENTS
+            ),
+            recorder,
+            curator,
+            sim,
+            RegisterEventHandler(OnProcessExit(target_action=sim, on_exit=recorded)),
+        ]
+    )

@@ -1,0 +1,57 @@
+"""Fixtures of every test that runs nodes: a graph of its own, and nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import time
+import uuid
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+_MARK = "CURATION_ROS_TEST"
+
+
+@pytest.fixture(scope="module")
+def graph(tmp_path_factory, no_process_left):
+    """A ROS graph on a domain of its own; its nodes end with the module."""
+    with ExitStack() as stack:
+        yield from _graph(stack, tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def other_graph(tmp_path_factory, no_process_left):
+    """Another one, on another domain."""
+    with ExitStack() as stack:
+        yield from _graph(stack, tmp_path_factory)
+
+
+def _graph(stack, tmp_path_factory):
+    from graph import Graph  # where rclpy is missing, importing it skips
+
+    yield stack.enter_context(Graph(tmp_path_factory.mktemp("graph")))
+
+
+@pytest.fixture(scope="session")
+def no_process_left():
+    """Every process that a test starts, and what that starts, is gone in the end."""
+    mark = f"{_MARK}={uuid.uuid4()}"
+    os.environ.update([mark.split("=")])
+    yield
+    deadline_s = time.monotonic() + 5.0
+    while (left := _processes(mark.encode())) and time.monotonic() < deadline_s:
+        time.sleep(0.1)
+    assert not left, f"left behind: {left}"
+
+
+def _processes(mark: bytes) -> list[str]:
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            # Our own environment was read by /proc before the mark was set.
+            if mark in (folder / "environ").read_bytes().split(b"\0"):
+                found.append((folder / "cmdline").read_bytes().replace(b"\0", b" ").decode())
+        except OSError:
+            continue
+    return found

@@ -1,0 +1,220 @@
+"""A ROS graph of a test's own: node processes, and a probe in this process that listens."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import pytest
+
+from curation_ros.core.decisions import Decision
+from curation_ros.core.status import EpisodeEvent, Status, event_from_status
+from curation_ros.dataset import Dataset
+from curation_ros.processes import Domain, Nodes
+
+try:
+    import rclpy
+    import rclpy.context
+    from diagnostic_msgs.msg import DiagnosticArray, KeyValue
+    from rclpy.executors import SingleThreadedExecutor
+
+    from curation_ros.nodes.messages import single_from_ros, status_from_ros
+    from curation_ros.nodes.qos import DECISIONS, EVENTS, LATCHED
+except ImportError as err:
+    pytest.skip(f"rclpy is not installed: {err}", allow_module_level=True)
+
+#: Patience for anything that takes part of a second on an idle machine.
+PATIENCE_S = 60.0
+_TAIL = 12
+
+
+class Graph:
+    """Nodes on a domain of their own, and what was said on their topics since the start.
+
+    Attributes:
+        folder: for datasets and files of the test.
+        events: of topic `episode`.
+        outcomes: of topic `episode/outcome`.
+        recorders: of topic `recorder/status`.
+        decisions: of topic `curator/decision`.
+        health: of /diagnostics.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.events: list[EpisodeEvent] = []
+        self.outcomes: list[Status] = []
+        self.recorders: list[Status] = []
+        self.decisions: list[Status] = []
+        self.health: list[Status] = []
+        self._namespaces: set[str] = set()
+
+    def __enter__(self) -> Graph:
+        self.domain = Domain()
+        os.environ.update(self.domain.environment)
+        self.nodes = Nodes(self.domain, self.folder / "logs")
+        self.context = rclpy.context.Context()
+        rclpy.init(context=self.context, domain_id=self.domain.id)
+        self.node = rclpy.create_node("probe", context=self.context)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self.node.create_subscription(
+            DiagnosticArray,
+            "/diagnostics",
+            lambda m: self.health.extend(status_from_ros(s) for s in m.status),
+            EVENTS,
+        )
+        self.override_publisher = self.node.create_publisher(KeyValue, "curator/override", EVENTS)
+        self.listen("")
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.nodes.__exit__(kind, error, trace)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+        self.domain.close()
+
+    def listen(self, namespace: str) -> None:
+        """Listen to the episodes and decisions of a namespace, too."""
+        for topic, qos, sink in (
+            ("episode", LATCHED, lambda s: self.events.append(event_from_status(s))),
+            ("episode/outcome", LATCHED, self.outcomes.append),
+            ("recorder/status", LATCHED, self.recorders.append),
+            ("curator/decision", DECISIONS, self.decisions.append),
+        ):
+            self.node.create_subscription(
+                DiagnosticArray,
+                namespace + topic,
+                lambda m, sink=sink: sink(single_from_ros(m)),
+                qos,
+            )
+
+    # --- nodes ------------------------------------------------------------------------------
+
+    def start(
+        self,
+        node: str,
+        key: str = "",
+        remaps: Mapping[str, str] | None = None,
+        **parameters: Any,
+    ) -> None:
+        """Start a node; its key is its name in the other methods."""
+        self.nodes.start(node, parameters, key=key, remaps=remaps)
+
+    def stop(self, *keys: str) -> None:
+        """Stop nodes that were started."""
+        for key in keys:
+            self.nodes.stop(key)
+
+    def log(self, key: str) -> str:
+        """What a node has printed."""
+        path = self.folder / "logs" / f"{key}.log"
+        return path.read_text(errors="replace") if path.exists() else ""
+
+    def expect_exit(self, key: str) -> tuple[int, str]:
+        """Wait for a node to end by itself; returns its exit code and its output."""
+        self.until(lambda: self.nodes.ended(key) is not None, f"{key} ends")
+        code = self.nodes.ended(key)
+        self.stop(key)
+        assert code is not None
+        return code, self.log(key)
+
+    # --- waiting ----------------------------------------------------------------------------
+
+    def spin(self, seconds: float = 0.02) -> None:
+        """Listen until something was heard, at most that long."""
+        self._executor.spin_once(timeout_sec=seconds)
+
+    def until(
+        self, condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S
+    ) -> Any:
+        """Listen until a condition holds; returns what it returned."""
+        deadline_s = time.monotonic() + timeout_s
+        while not (found := condition()):
+            if time.monotonic() > deadline_s:
+                raise AssertionError(f"not within {timeout_s:g} s: {what}\n{self._tails()}")
+            self.spin()
+        return found
+
+    def quiet(self, seconds: float) -> None:
+        """Listen for a while: for what must not happen."""
+        deadline_s = time.monotonic() + seconds
+        while time.monotonic() < deadline_s:
+            self.spin()
+
+    def _tails(self) -> str:
+        logs = sorted((self.folder / "logs").glob("*.log"))
+        return "\n".join(
+            f"--- {log.name}\n" + "\n".join(log.read_text().splitlines()[-_TAIL:]) for log in logs
+        )
+
+    def ready(self, *keys: str, line: str = "domain ") -> None:
+        """Wait until nodes have said in their logs that they are up."""
+        for key in keys:
+
+            def is_up(key: str = key) -> bool:
+                assert self.nodes.ended(key) is None, self.log(key)
+                return line in self.log(key)
+
+            self.until(is_up, f"{key} logs {line!r}")
+
+    def recorded(self, episode_id: str) -> Status:
+        """Wait until a recorder has closed an episode, or failed to."""
+        return self.until(
+            lambda: next(
+                (
+                    s
+                    for s in self.recorders
+                    if s.hardware_id == episode_id and not s.message.startswith("recording")
+                ),
+                None,
+            ),
+            f"recorder closes {episode_id}",
+        )
+
+    def decided(self, episode_id: str, revision: int = 1) -> Status:
+        """Wait until a decision on an episode has been published, with that revision or a later."""
+        return self.until(
+            lambda: next(
+                (
+                    s
+                    for s in reversed(self.decisions)
+                    if s.hardware_id == episode_id and int(s.values["revision"]) >= revision
+                ),
+                None,
+            ),
+            f"revision {revision} of the decision on {episode_id}",
+        )
+
+    def settled(self, dataset: Path, episode_id: str) -> Decision:
+        """Wait until the curator has compared an episode with its bag; the last decision on it."""
+
+        def compared() -> Decision | None:
+            known = Dataset(dataset).decisions(episode_id)
+            return known[-1] if known and "bag" in known[-1].evidence else None
+
+        return self.until(compared, f"decision on {episode_id} compared with its bag")
+
+    def problem(self, node: str, text: str) -> Status:
+        """Wait for a complaint of a node on /diagnostics."""
+        return self.until(
+            lambda: next(
+                (s for s in self.health if s.name == node and s.level and text in s.message), None
+            ),
+            f"{node} complains of {text!r} on /diagnostics",
+        )
+
+
+def jsonl(text: str) -> list[dict[str, Any]]:
+    """Rows of JSON lines."""
+    return [json.loads(line) for line in text.splitlines()]
