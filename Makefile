@@ -12,20 +12,25 @@ TORCH ?=
 ifdef TORCH_BACKEND
 export UV_TORCH_BACKEND := $(TORCH_BACKEND)
 endif
+# Of the extras, so that asking for others installs them.
+READY := $(VENV)/.ready-$(EXTRAS)
 
 .PHONY: setup demo test check bench clean
 
-setup: $(VENV)/.ready
+setup: $(READY)
 
-$(VENV)/.ready: setup.py pyproject.toml package.xml $(wildcard libexec/* launch/* config/*)
-	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(0 if (3, 10) <= v[:2] <= (3, 13) else \
-		f"error: Python 3.10 to 3.13 is needed, {sys.executable} is {v[0]}.{v[1]}: make PYTHON=...")'
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
-		{ echo "error: '$(PYTHON) -m venv' failed: install python3-venv"; exit 2; }
-	@test -x $(BIN)/uv || $(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+$(BIN)/uv:
+	@command -v $(PYTHON) >/dev/null || { echo "error: no $(PYTHON) here: make PYTHON=..." >&2; exit 2; }
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit((3, 10) > v[:2] or v[:2] > (3, 13))' || \
+		{ echo "error: Python 3.10 to 3.13 is needed, this is $$($(PYTHON) --version): make PYTHON=..." >&2; exit 2; }
+	@$(PYTHON) -m venv $(VENV) >/dev/null || \
+		{ rm -rf $(VENV); echo "error: $(PYTHON) cannot make $(VENV): apt install python3-venv" >&2; exit 2; }
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+
+$(READY): setup.py pyproject.toml package.xml $(wildcard libexec/* launch/* config/*) | $(BIN)/uv
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[$(EXTRAS)]' $(if $(TORCH),'$(TORCH)')
-	@# An editable installation leaves out what ros2 run and ros2 launch look up.
-	@$(BIN)/python setup.py --quiet install_data --install-dir $(abspath $(VENV))
+	@# An editable installation leaves out what ros2 run and ros2 launch look up; colcon does this too.
+	@$(BIN)/python -W ignore setup.py --quiet install_data --install-dir $(abspath $(VENV))
 	@touch $@
 
 demo: setup
@@ -44,4 +49,4 @@ bench: setup
 	$(BIN)/python benchmarks/run.py
 
 clean:
-	rm -rf $(VENV) build install log *.egg-info
+	rm -rf $(VENV) build install log *.egg-info .*_cache .hypothesis

@@ -3,23 +3,24 @@
 All metadata stands here and none in setup.cfg or [project]: colcon reads setup.py.
 """
 
+import re
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
 PACKAGE = "curation_ros"
-NODES = {
-    "sim_node": "sim_node.node:main",
-    "recorder": "curation_ros.nodes.recorder:main",
-    "curator": "curation_ros.nodes.curator:main",
-    "policy_node": "policy_node.node:main",
-    "replay": "curation_ros.nodes.replay:main",
+NODES = ("sim_node", "recorder", "curator", "policy_node", "replay")
+EXECUTABLES = {
+    **{node: f"curation_ros.executables:{node}" for node in NODES},
     "curation": "curation_ros.cli.main:main",
 }
+# Not imported: nothing is installed yet. package.xml repeats the version, and a test compares.
+VERSION = re.findall(r'__version__ = "(.+)"', Path(PACKAGE, "__init__.py").read_text("utf-8"))[0]
 
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version=VERSION,
     description="Curate robot demonstrations on a ROS 2 graph, and prove it by the policy",
     license="Apache-2.0",
     python_requires=">=3.10",
@@ -34,6 +35,8 @@ setup(
         (f"share/{PACKAGE}/config", glob("config/*.yaml")),
         (f"lib/{PACKAGE}", sorted(glob("libexec/*"))),
     ],
+    # The floors are the versions of Ubuntu 24.04, so that pip leaves alone the NumPy that the
+    # messages of ROS 2 Jazzy from apt are compiled for.
     install_requires=[
         "lz4",
         "mcap>=1.6",
@@ -65,5 +68,8 @@ setup(
         ],
     },
     zip_safe=False,
-    entry_points={"console_scripts": [f"{name} = {target}" for name, target in NODES.items()]},
+    entry_points={"console_scripts": [f"{k} = {v}" for k, v in EXECUTABLES.items()]},
+    # colcon writes the path of its own Python into programs, which with apt is the system's; so
+    # they run on the virtual environment that is active, where pip has put the requirements.
+    options={"build_scripts": {"executable": "/usr/bin/env python3"}},
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,14 +23,13 @@ def share_file(relative: str) -> Path:
     Raises:
         ConfigError: if it is in neither.
     """
+    # The prefix is some folders above <prefix>/lib/python3.x/site-packages, with pip and colcon
+    # alike. It need not be sys.prefix: a workspace of colcon lies over an environment.
     share = Path("share") / "curation_ros" / relative
-    # <prefix>/lib/python3.x/site-packages is three below the prefix, with pip and colcon alike.
-    candidates = [_SOURCE / relative, Path(sys.prefix) / share]
-    candidates += [parent / share for parent in _SOURCE.parents]
-    for candidate in candidates:
+    for candidate in (_SOURCE / relative, *(folder / share for folder in _SOURCE.parents)):
         if candidate.is_file():
             return candidate
-    raise ConfigError(f"{relative}: not found; looked in {', '.join(map(str, candidates[:2]))}")
+    raise ConfigError(f"{relative}: neither in {_SOURCE} nor in {share} of a folder above it")
 
 
 def topic_map_or_default(path: str) -> TopicMap:

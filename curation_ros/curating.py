@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,6 +23,8 @@ from curation_ros.dataset import Dataset
 
 #: Verdicts that a person may give; to salvage needs a span, which only a scorer knows.
 OVERRIDES = ("keep", "discard", "review")
+#: Episodes whose live form is kept until their bags close.
+_REMEMBERED = 8
 
 
 @dataclass
@@ -36,11 +39,11 @@ class Decided:
 
     Attributes:
         decision: as logged.
-        latency_s: from the gate's closing to the decision on disk.
+        latency_s: from the gate's closing to the decision on disk; None for that of a bag.
     """
 
     decision: Decision
-    latency_s: float
+    latency_s: float | None = None
 
 
 class LiveCuration:
@@ -77,6 +80,8 @@ class LiveCuration:
         self._decoder = decoder
         self._live: dict[str, _Live] = {}
         self._seen: dict[str, Episode] = {}
+        self._read: deque[str] = deque(maxlen=_REMEMBERED)
+        self._unread: set[str] = set()
 
     def event(self, event: EpisodeEvent, now_s: float) -> list[Decided]:
         """Take an event of the episode's owner."""
@@ -106,47 +111,83 @@ class LiveCuration:
 
     def tick(self, now_s: float) -> list[Decided]:
         """Decide on every episode whose gate has closed."""
-        return [self._decide_live(closed) for closed in self.gate.close_ready(now_s)]
+        decided = []
+        for closed in self.gate.close_ready(now_s):
+            decided.append(self._decide_live(closed))
+            if closed.event.id in self._unread:
+                self._unread.remove(closed.event.id)
+                decided.append(self._decide_bag(closed.event.id))
+        return [d for d in decided if d is not None]
 
-    def _decide_live(self, closed: Closed) -> Decided:
+    @property
+    def running(self) -> str:
+        """Id of the episode that runs, empty if none does."""
+        return self.gate.open_ids[-1] if self.gate.open_ids else ""
+
+    def counts(self) -> dict[str, int]:
+        """Samples by topic that the running episode has so far."""
+        window = self.gate.window(self.running)
+        counts = window.counts() if window is not None else {}
+        return {topic: counts.get(topic, 0) for topic in self.topic_map.topics}
+
+    def _decide_live(self, closed: Closed) -> Decided | None:
+        """The decision on what was seen; None where there is nothing to decide on.
+
+        Nothing was seen of an episode that was over before we came: its owner's latched words
+        are all that is left of it. And a bag that was read already has the say.
+        """
         began = time.perf_counter()
         live = self._live.pop(closed.event.id)
+        is_live = closed.event.source == "live"
+        if is_live and (closed.event.id in self._read or not any(closed.counts.values())):
+            return None
         end_ns = closed.event.end_ns
         if end_ns is None:
             end_ns = live.builder.partial().end_ns
         event = replace(closed.event, end_ns=end_ns)
         episode = live.builder.finish(end_ns, event.counts, owner_findings(event))
         self._seen[episode.id] = episode
-        while len(self._seen) > 8:
+        while len(self._seen) > _REMEMBERED:
             del self._seen[next(iter(self._seen))]
         decision = log_decision(
             self.dataset, self.curation.decide(episode, revision=1, by=CURATOR)
         )
         return Decided(decision, time.perf_counter() - began)
 
-    def bag_closed(self, episode_id: str) -> Decision | None:
+    def bag_closed(self, episode_id: str) -> list[Decided]:
         """Compare a closed bag with what was seen live; where they differ, the bag wins.
 
-        Returns:
-            The new revision, or None where the decision stands.
+        Where our own gate is about to close, that is waited for: `tick` does it then. Where
+        nobody has said that the episode ended, its recorder was stopped: the bag is read now.
         """
+        window = self.gate.window(episode_id)
+        if window is not None and window.ended is not None:
+            self._unread.add(episode_id)
+            return []
+        decided = self._decide_bag(episode_id)
+        return [] if decided is None else [decided]
+
+    def _decide_bag(self, episode_id: str) -> Decided | None:
+        """The decision on a bag; None where the one before stands."""
         live = self._seen.pop(episode_id, None)
         known = self.dataset.decisions(episode_id)
-        last = known[-1] if known else None
         try:
             episode = read_episode(self.dataset.bag_path(episode_id), self.topic_map)
         except CurationError as err:
-            if last is not None:
-                self._amend(last, {"bag": f"not seen: {err}"})
+            if known:
+                self._amend(known[-1], {"bag": f"not seen: {err}"})
             return None
-        if live is not None and last is not None:
+        self._read.append(episode_id)
+        found = "alone"
+        if live is not None:
             same = live.digest == episode.digest and live.findings == episode.findings
-            if same:
-                self._amend(last, {"bag": "equal"})
-                return None
+            found = "equal" if same else "differs"
+        if known and found == "equal":
+            self._amend(known[-1], {"bag": found})
+            return None
         decision = self.curation.decide(episode, revision=1, by=CURATOR)
-        evidence = {**decision.evidence, "bag": "differs" if live is not None else "alone"}
-        return log_decision(self.dataset, replace(decision, evidence=evidence))
+        evidence = {**decision.evidence, "bag": found}
+        return Decided(log_decision(self.dataset, replace(decision, evidence=evidence)))
 
     def override(self, prefix: str, verdict: str, reason: str, by: str) -> Decision:
         """Log a person's decision.
@@ -175,9 +216,12 @@ def log_decision(dataset: Dataset, decision: Decision) -> Decision:
         The decision in force: a person's, where a person has decided.
     """
     known = dataset.decisions(decision.episode)
-    own = [d for d in known if d.by == CURATOR]
-    if not own or not _says_the_same(own[-1], decision):
+    own = in_force(d for d in known if d.by == CURATOR).get(decision.episode)
+    if own is None or not _says_the_same(own, decision):
         known.append(dataset.append_decision(decision))
+    elif not decision.evidence.items() <= own.evidence.items():
+        same = replace(decision, revision=own.revision)
+        known.append(dataset.append_decision(same, amend=True))
     return in_force(known)[decision.episode]
 
 

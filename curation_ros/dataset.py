@@ -27,22 +27,29 @@ from curation_ros.core.identity import resolve_prefix
 from curation_ros.core.selection import Manifest
 
 _SCHEMA = """
-CREATE TABLE IF NOT EXISTS episodes (
+CREATE TABLE episodes (
     id TEXT PRIMARY KEY, name TEXT NOT NULL, path TEXT NOT NULL, start_ns INTEGER NOT NULL,
     end_ns INTEGER NOT NULL, event TEXT NOT NULL, source TEXT NOT NULL,
     recovered INTEGER NOT NULL);
-CREATE TABLE IF NOT EXISTS decisions (
+CREATE TABLE decisions (
     episode TEXT NOT NULL, revision INTEGER NOT NULL, verdict TEXT NOT NULL, reason TEXT NOT NULL,
     by TEXT NOT NULL, state_hash TEXT NOT NULL, span_start INTEGER NOT NULL,
     span_end INTEGER NOT NULL, PRIMARY KEY (episode, revision));
-CREATE TABLE IF NOT EXISTS scores (
+CREATE TABLE scores (
     episode TEXT NOT NULL, scorer TEXT NOT NULL, state_hash TEXT NOT NULL, value REAL,
     abstained TEXT, PRIMARY KEY (episode, scorer, state_hash));
-CREATE TABLE IF NOT EXISTS selections (
+CREATE TABLE selections (
     name TEXT PRIMARY KEY, path TEXT NOT NULL, created_at TEXT NOT NULL, kept INTEGER NOT NULL,
     total INTEGER NOT NULL);
+PRAGMA user_version = 1;
 """
+_SCHEMA_VERSION = 1
+_TABLES = ("episodes", "decisions", "scores", "selections")
 _BUSY_TIMEOUT_S = 10.0
+
+
+class _SpoiltIndexError(CurationError):
+    """The index is no database, or one of another version of ours."""
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -62,10 +69,29 @@ def write_atomically(path: Path, text: str) -> None:
     sync_folder(path.parent)
 
 
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the lock file of a folder against other processes and threads."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+@contextmanager
+def _named_errors(path: Path) -> Iterator[None]:
+    """What the system refuses becomes an error for people, with the file's name."""
+    try:
+        yield
+    except OSError as err:
+        raise CurationError(f"{err.filename or path}: {err.strerror or err}") from err
+
+
 def _append_line(path: Path, record: Mapping[str, Any]) -> None:
     """Append one JSON line and sync it; a torn last line (a crash) is ended first."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+b") as out:
+        fcntl.flock(out, fcntl.LOCK_EX)  # half of another's line would look like a torn one
         end = out.seek(0, os.SEEK_END)
         if end:
             out.seek(end - 1)
@@ -79,9 +105,12 @@ def _append_line(path: Path, record: Mapping[str, Any]) -> None:
 def _read_lines(path: Path) -> list[dict[str, Any]]:
     """Whole JSON lines of a log; a torn line is skipped, a missing file is empty."""
     try:
-        lines = path.read_bytes().splitlines()
-    except FileNotFoundError:
-        return []
+        with _named_errors(path):
+            lines = path.read_bytes().splitlines()
+    except CurationError as err:
+        if isinstance(err.__cause__, FileNotFoundError):
+            return []
+        raise
     records = []
     for line in lines:
         with suppress(ValueError):
@@ -167,8 +196,16 @@ class Dataset:
         return self.path / "decisions" / f"{episode_id}.jsonl"
 
     def decisions(self, episode_id: str) -> list[Decision]:
-        """All decisions on an episode, oldest first."""
-        return [Decision.from_json(line) for line in _read_lines(self.decision_log(episode_id))]
+        """All decisions on an episode, oldest first.
+
+        Raises:
+            CurationError: naming the log, if it cannot be read or a whole line is no decision.
+        """
+        log = self.decision_log(episode_id)
+        try:
+            return [Decision.from_json(line) for line in _read_lines(log)]
+        except EpisodeError as err:
+            raise EpisodeError(f"{log}: {err}") from err
 
     def latest_decisions(self) -> dict[str, Decision]:
         """The decision in force of every decided episode, by id."""
@@ -187,30 +224,37 @@ class Dataset:
         """Log a decision under the next revision number, on disk when this returns.
 
         Args:
-            decision: its own revision number is not looked at.
-            amend: log it under the latest number (the same decision with more evidence).
+            decision: its own revision number counts only to amend.
+            amend: log it under its own number (the same decision with more evidence).
 
         Returns:
             The decision with the revision that it got.
+
+        Raises:
+            CurationError: if the log cannot be written.
         """
         log = self.decision_log(decision.episode)
-        log.parent.mkdir(parents=True, exist_ok=True)
         # The lock makes numbering and appending one step when curator and CLI decide at once.
-        with (log.parent / ".lock").open("a") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            known = self.decisions(decision.episode)
-            latest = known[-1].revision if known else 0
-            numbered = replace(decision, revision=max(1, latest if amend else latest + 1))
-            _append_line(log, numbered.to_json())
-        with suppress(sqlite3.Error), self._index() as db:
-            _index_decision(db, numbered)
-        return numbered
+        with _named_errors(log), _locked(log.parent):
+            if not amend:
+                revisions = [d.revision for d in self.decisions(decision.episode)]
+                decision = replace(decision, revision=max(revisions, default=0) + 1)
+            _append_line(log, decision.to_json())
+        with suppress(CurationError), self._index() as db:
+            _index_decision(db, decision)
+        return decision
 
     # --- truth and selections ---------------------------------------------------------------
 
     def append_truth(self, record: Mapping[str, Any]) -> None:
-        """Append a line to truth.jsonl: outcomes and injected defects, for evaluation only."""
-        _append_line(self.path / "truth.jsonl", record)
+        """Append a line to truth.jsonl: outcomes and injected defects, for evaluation only.
+
+        Raises:
+            CurationError: if it cannot be written.
+        """
+        path = self.path / "truth.jsonl"
+        with _named_errors(path):
+            _append_line(path, record)
 
     def truth(self) -> dict[str, dict[str, Any]]:
         """Merged truth lines by episode id; later lines win."""
@@ -223,14 +267,15 @@ class Dataset:
         """Write a selection; the name decides the file, and a file is never overwritten.
 
         Raises:
-            CurationError: if a selection of that name with other content exists.
+            CurationError: if a selection of that name exists, or it cannot be written.
         """
         path = self.path / "selections" / f"{manifest.name}.json"
         text = json.dumps(manifest.to_json(), indent=1, allow_nan=False) + "\n"
-        if path.exists():
-            raise CurationError(f"selection {path} exists: choose another --name")
-        write_atomically(path, text)
-        with suppress(sqlite3.Error), self._index() as db:
+        with _named_errors(path), _locked(path.parent):
+            if path.exists():
+                raise CurationError(f"selection {path} exists: choose another --name")
+            write_atomically(path, text)
+        with suppress(CurationError), self._index() as db:
             _index_selection(db, manifest, path)
         return path
 
@@ -247,14 +292,22 @@ class Dataset:
 
     @contextmanager
     def _index(self) -> Iterator[sqlite3.Connection]:
+        """One transaction on the index."""
         path = self.index_path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with closing(sqlite3.connect(path, timeout=_BUSY_TIMEOUT_S)) as db:
-            db.execute("PRAGMA journal_mode=WAL")
-            db.execute("PRAGMA synchronous=NORMAL")  # a cache may lose its last lines
-            db.executescript(_SCHEMA)
-            with db:
-                yield db
+        try:
+            if not path.exists():
+                _create_index(path)
+            with closing(sqlite3.connect(path, timeout=_BUSY_TIMEOUT_S)) as db:
+                [version] = db.execute("PRAGMA user_version").fetchone()
+                if version != _SCHEMA_VERSION:
+                    raise sqlite3.DatabaseError(f"version {version}, not {_SCHEMA_VERSION}")
+                db.execute("PRAGMA synchronous=NORMAL")  # a cache may lose its last lines
+                with db:
+                    yield db
+        except (OSError, sqlite3.Error) as err:
+            # The classes below DatabaseError are about a statement or the moment.
+            kind = _SpoiltIndexError if type(err) is sqlite3.DatabaseError else CurationError
+            raise kind(f"index {path}: {err}; curation index --rebuild makes it anew") from err
 
     def refresh(self) -> list[str]:
         """Bring the index up to date with bags that have come or gone.
@@ -262,60 +315,110 @@ class Dataset:
         Returns:
             One line for every bag that could not be read; the others are indexed all the same.
         """
-        problems = []
         present = {p.name: p for p in self.bags()}
-        with self._index() as db:
-            known = {row[0] for row in db.execute("SELECT id FROM episodes")}
-            db.executemany(
-                "DELETE FROM episodes WHERE id = ?", [(i,) for i in known - set(present)]
-            )
-            for name in sorted(set(present) - known):
-                try:
-                    _index_bag(db, open_bag(present[name]), name)
-                except CurationError as err:
-                    problems.append(str(err))
+        try:
+            with self._index() as db:
+                known = {row[0] for row in db.execute("SELECT id FROM episodes")}
+        except _SpoiltIndexError:
+            return self.rebuild()
+        rows, problems = _bag_rows({i: present[i] for i in sorted(set(present) - known)})
+        gone = [(i,) for i in known - set(present)]
+        if rows or gone:
+            with self._index() as db:
+                db.executemany("DELETE FROM episodes WHERE id = ?", gone)
+                db.executemany(_INSERT_EPISODE, rows)
         return problems
 
     def rebuild(self) -> list[str]:
         """Make the index anew from bags, logs and manifests; returns what was unreadable."""
-        for suffix in ("", "-wal", "-shm"):
-            with suppress(FileNotFoundError):
-                Path(f"{self.index_path}{suffix}").unlink()
-        problems = self.refresh()
-        with self._index() as db:
-            for log in sorted((self.path / "decisions").glob("*.jsonl")):
-                for decision in self.decisions(log.stem):
+        rows, problems = _bag_rows({p.name: p for p in self.bags()})
+        decisions: list[Decision] = []
+        for log in sorted((self.path / "decisions").glob("*.jsonl")):
+            try:
+                decisions += self.decisions(log.stem)
+            except CurationError as err:
+                problems.append(str(err))
+        manifests: list[tuple[Manifest, Path]] = []
+        for path in sorted((self.path / "selections").glob("*.json")):
+            try:
+                manifests.append((Manifest.from_json(json.loads(path.read_text())), path))
+            except (ValueError, OSError, CurationError) as err:
+                problems.append(f"selection {path}: {err}")
+
+        def fill() -> None:
+            with self._index() as db:
+                for table in _TABLES:
+                    db.execute(f"DELETE FROM {table}")
+                db.executemany(_INSERT_EPISODE, rows)
+                for decision in decisions:
                     _index_decision(db, decision)
-            for path in sorted((self.path / "selections").glob("*.json")):
-                try:
-                    _index_selection(db, Manifest.from_json(json.loads(path.read_text())), path)
-                except (ValueError, CurationError) as err:
-                    problems.append(f"selection {path}: {err}")
+                for manifest, path in manifests:
+                    _index_selection(db, manifest, path)
+
+        try:
+            fill()
+        except _SpoiltIndexError:
+            # Only a file that is of no use to anybody is removed from under other processes.
+            with _named_errors(self.index_path):
+                self.index_path.unlink(missing_ok=True)
+            fill()
         return problems
 
     def rows(self, query: str, parameters: tuple[object, ...] = ()) -> list[sqlite3.Row]:
-        """Read from the index (tables episodes, scores, decisions, selections)."""
+        """Read from the index (tables episodes, scores, decisions, selections).
+
+        Raises:
+            CurationError: if it is spoilt, or the query makes no sense.
+        """
         with self._index() as db:
             db.row_factory = sqlite3.Row
             return list(db.execute(query, parameters))
 
 
-def _index_bag(db: sqlite3.Connection, bag: Bag, episode_id: str) -> None:
+def _create_index(path: Path) -> None:
+    """Make an empty index; it appears whole, so that nobody ever opens half of one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = path.with_name(f".{path.name}.new")
+    with new.with_suffix(".lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if path.exists():
+            return
+        # What an index that was deleted has left would be played into the new one.
+        for left in (new, *(Path(f"{p}{end}") for p in (new, path) for end in ("-wal", "-shm"))):
+            left.unlink(missing_ok=True)
+        with closing(sqlite3.connect(new)) as db:
+            db.execute("PRAGMA journal_mode=WAL")
+            db.executescript(_SCHEMA)
+        os.rename(new, path)
+
+
+_INSERT_EPISODE = "INSERT OR REPLACE INTO episodes VALUES (?,?,?,?,?,?,?,?)"
+
+
+def _bag_rows(folders: Mapping[str, Path]) -> tuple[list[tuple[object, ...]], list[str]]:
+    """Rows of the table episodes, and what is wrong with the bags that have none."""
+    rows, problems = [], []
+    for episode_id, folder in folders.items():
+        try:
+            rows.append(_bag_row(open_bag(folder), episode_id))
+        except CurationError as err:
+            problems.append(str(err))
+    return rows, problems
+
+
+def _bag_row(bag: Bag, episode_id: str) -> tuple[object, ...]:
     event = bag.event()
     if event is None:
         raise EpisodeError(f"bag {bag.path}: no 'episode' in its custom data: not of our recorder")
-    db.execute(
-        "INSERT OR REPLACE INTO episodes VALUES (?,?,?,?,?,?,?,?)",
-        (
-            episode_id,
-            event.name,
-            f"episodes/{episode_id}",
-            event.start_ns,
-            event.end_ns or event.start_ns,
-            event.event,
-            event.source,
-            int(bag.custom_data.get("recovered") == "true"),
-        ),
+    return (
+        episode_id,
+        event.name,
+        f"episodes/{episode_id}",
+        event.start_ns,
+        event.end_ns or event.start_ns,
+        event.event,
+        event.source,
+        int(bag.custom_data.get("recovered") == "true"),
     )
 
 

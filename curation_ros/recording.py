@@ -118,6 +118,7 @@ class Recording:
         )
         self._publishers = publishers or (lambda _topic: 1)
         self._open: dict[str, _OpenBag] = {}
+        self._known: set[str] = set()
         self._flushed_s = 0.0
         self._space_checked_s = 0.0
         self._max_gap_ns = int(topic_map.max_gap_s * NS_PER_S)
@@ -128,8 +129,11 @@ class Recording:
         return tuple(self._open)
 
     def free_mb(self) -> float:
-        """Free space of the dataset's disk."""
-        return shutil.disk_usage(self.dataset.path).free / 1e6
+        """Free space of the dataset's disk; 0 where the disk has gone."""
+        try:
+            return shutil.disk_usage(self.dataset.path).free / 1e6
+        except OSError:
+            return 0.0
 
     def counts(self, episode_id: str) -> dict[str, int]:
         """Distinct stamps by topic that an open episode has so far."""
@@ -142,7 +146,10 @@ class Recording:
         early = self.gate.event(event, now_s)
         notices = []
         if event.event == "started" and event.id in self.gate.open_ids and not was_open:
-            notices.append(self._open_bag(event))
+            if self.dataset.bag_path(event.id).exists():
+                self._known.add(event.id)
+            else:
+                notices.append(self._open_bag(event))
             for sample in sorted(early, key=lambda s: s.log_ns):
                 notices += self._write(event.id, sample)
         return notices + self._close_ready(now_s)
@@ -189,30 +196,40 @@ class Recording:
     # --- one bag --------------------------------------------------------------------------------
 
     def _open_bag(self, event: EpisodeEvent) -> Notice:
-        if self.dataset.bag_path(event.id).exists():
-            return Notice("failed", event.id, event.name, "the dataset already has this episode")
         if self.free_mb() < self.min_free_mb:
             reason = f"{self.free_mb():.0f} MB free, at least {self.min_free_mb:g} are wanted"
             return Notice("failed", event.id, event.name, reason)
         folder = self.dataset.partial_path(event.id)
-        lock = _claim(folder)
+        try:
+            lock = _claim(folder)
+        except OSError as err:
+            reason = f"{err.filename or folder}: {err.strerror}"
+            return Notice("failed", event.id, event.name, reason)
         if lock is None:
             return Notice("failed", event.id, event.name, "another recorder has this episode")
         try:
             writer = BagWriter(folder, event.id, custom_data=self._custom_data(event))
-            for topic in self.topics.values():
-                writer.add_topic(topic.name, topic.type, (topic.qos,))
         except CurationError as err:
             lock.close()
             return Notice("failed", event.id, event.name, str(err))
         stats = {t: _TopicStats(publishers=self._publishers(t)) for t in self.topics}
-        self._open[event.id] = _OpenBag(event, writer, lock, stats)
+        bag = _OpenBag(event, writer, lock, stats)
+        try:
+            for topic in self.topics.values():
+                writer.add_topic(topic.name, topic.type, (topic.qos,))
+        except CurationError as err:
+            return self._drop(bag, str(err))
+        self._open[event.id] = bag
         return Notice("recording", event.id, event.name)
 
     def _write(self, episode_id: str, sample: Sample) -> list[Notice]:
         bag = self._open.get(episode_id)
         if bag is None:
-            return []
+            # Said only now: what is latched of an episode recorded long ago is no fault.
+            if episode_id not in self._known:
+                return []
+            self._known.remove(episode_id)
+            return [Notice("failed", episode_id, "", "the dataset already has this episode")]
         try:
             name = self.topics[sample.topic].name
             bag.writer.write(name, sample.log_ns, sample.publish_ns, sample.seq, sample.data)
@@ -236,6 +253,8 @@ class Recording:
             if stats.publishers > 1:
                 lines.append(f"unknown-loss: topic {topic!r} has {stats.publishers} publishers")
         event = replace(closed.event, reason="\n".join(lines))
+        if not any(bag.writer.counts.values()):
+            return self._drop(bag, "no message of it has arrived")
         try:
             bag.writer.close(self._custom_data(event, bag.stats, closed))
             self.dataset.publish_bag(event.id)
@@ -247,6 +266,15 @@ class Recording:
             bag.lock.close()
         reason = "; ".join(lines)
         return Notice("closed", event.id, event.name, reason, closed.counts)
+
+    def _drop(self, bag: _OpenBag, reason: str) -> Notice:
+        """Remove a bag that has nothing in it."""
+        folder = self.dataset.partial_path(bag.event.id)
+        bag.writer.abandon()
+        shutil.rmtree(folder, ignore_errors=True)
+        _unclaim(folder)
+        bag.lock.close()
+        return Notice("failed", bag.event.id, bag.event.name, reason)
 
     def _fail(self, episode_id: str, reason: str) -> Notice:
         """Give up a bag; what is on disk stays in `.partial` for the next start to recover."""
@@ -328,10 +356,14 @@ def recover_partials(dataset: Dataset) -> list[Notice]:
 
 
 def _recover(dataset: Dataset, partial: Path) -> Notice:
-    report = recover_bag(partial, dataset.bag_path(partial.name))
+    target = dataset.bag_path(partial.name)
+    if target.exists():  # a recovery was killed after its bag had appeared, which is then whole
+        reason = "its bag is there already"
+    else:
+        report = recover_bag(partial, target)
+        reason = f"recovered {sum(report.messages.values())} messages ({report.tail})"
+    event = open_bag(target).event()
     kept = dataset.path / "quarantine" / f"{partial.name}.partial"
     kept.parent.mkdir(exist_ok=True)
     partial.rename(kept)
-    event = open_bag(report.path).event()
-    reason = f"recovered {sum(report.messages.values())} messages ({report.tail})"
     return Notice("closed", partial.name, event.name if event is not None else "", reason)

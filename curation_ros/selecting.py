@@ -7,7 +7,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from curation_ros.bags.reader import read_episode
-from curation_ros.core.decisions import CURATOR, Decision
+from curation_ros.core.decisions import CURATOR, Decision, in_force
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.selection import Candidate, Manifest, select, tie_key
@@ -86,8 +86,8 @@ def save_selection(
 
 def _scored(dataset: Dataset, episode_id: str) -> Decision | None:
     """The curator's last decision: the one whose scores count, whatever a person decided."""
-    own = [d for d in dataset.decisions(episode_id) if d.by == CURATOR]
-    return own[-1] if own else None
+    own = in_force(d for d in dataset.decisions(episode_id) if d.by == CURATOR)
+    return own.get(episode_id)
 
 
 def _score(decision: Decision | None, scorer: str) -> float | None:
@@ -111,7 +111,11 @@ def read_manifest(path: Path) -> tuple[Manifest, Dataset]:
         raise ConfigError(f"selection {path}: {err.strerror}") from err
     except ValueError as err:
         raise ConfigError(f"selection {path} is not JSON: {err}") from err
-    return Manifest.from_json(raw), Dataset(path.resolve().parent.parent)
+    try:
+        manifest = Manifest.from_json(raw)
+    except ConfigError as err:
+        raise ConfigError(f"{path}: {err}") from err
+    return manifest, Dataset(path.resolve().parent.parent)
 
 
 def read_selected(

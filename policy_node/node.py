@@ -64,7 +64,9 @@ class PolicyNode(Node):
         """Report."""
         now_s = time.monotonic()
         if self._health.due(now_s):
-            self._health.publish(now_s, [self._problem] if self._problem else [], {})
+            problems = [self._problem] if self._problem else []
+            problems += self._mapped.check(running=self._episode is not None)
+            self._health.publish(now_s, problems, {})
         return False
 
     def close(self) -> None:

@@ -109,6 +109,21 @@ class ObservationSpec:
         names = (name for term in self.terms for name, at_start in _operands(term) if not at_start)
         return tuple(dict.fromkeys(names))
 
+    @cached_property
+    def start_effect(self) -> Floats:
+        """(S, D) change of each column by each value of `start_fields`, in their order."""
+        rows = {name: 3 * k for k, name in enumerate(self.start_fields)}
+        effect = np.zeros((3 * len(rows), self.width))
+        first = 0
+        for term in self.terms:
+            operands = _operands(term)
+            width = len(self.phase_labels) if term == PHASE else _WIDTHS[operands[0][0]]
+            for sign, (name, at_start) in zip((1.0, -1.0), operands, strict=False):
+                if at_start:
+                    effect[rows[name] : rows[name] + 3, first : first + 3] = sign * np.eye(3)
+            first += width
+        return effect
+
     def check(self, topic_map: TopicMap, where: str) -> None:
         """Refuse a topic map that cannot give these observations.
 

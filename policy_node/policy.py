@@ -30,7 +30,15 @@ WEIGHTS = "policy.safetensors"
 FORMAT = 1
 
 # What JSON must hold for each key of a card beside the text ones.
-_NUMBERS = ("action_scale", "std_floor", "lr", "weight_decay", "clipped_fraction", "seconds")
+_NUMBERS = (
+    "action_scale",
+    "std_floor",
+    "lr",
+    "weight_decay",
+    "start_jitter_m",
+    "clipped_fraction",
+    "seconds",
+)
 _COUNTS = ("seed", "steps", "batch_size")
 _LISTS = ("columns", "phase_labels", "widths", "episodes", "curve")
 
@@ -49,7 +57,7 @@ class Card:
         selection_name, selection_hash: manifest of these episodes; empty without one.
         episodes: `id`, `span` (nanoseconds from the start stamp, or null for all) and `n_steps`
             of each, sorted by id.
-        seed, steps, batch_size, lr, weight_decay, std_floor: of the training.
+        seed, steps, batch_size, lr, weight_decay, std_floor, start_jitter_m: of the training.
         clipped_fraction: of the twist values of the training set, how many were beyond the scale.
         curve: [step, mean loss of the batches since the entry before].
         seconds: that the training took.
@@ -73,6 +81,7 @@ class Card:
     lr: float
     weight_decay: float
     std_floor: float
+    start_jitter_m: float
     clipped_fraction: float
     curve: tuple[tuple[int, float], ...]
     seconds: float

@@ -59,6 +59,7 @@ def train(
     weight_decay: float = 1e-4,
     hidden: tuple[int, ...] = (256, 256),
     std_floor: float = 2e-3,
+    start_jitter_m: float = 0.0,
     variant: str = "relative",
     action_scale: float = 0.2,
     selection: tuple[str, str] = ("", ""),
@@ -74,7 +75,7 @@ def train(
         episodes: whole episodes, each with the span to learn from (nanoseconds from the start
             stamp, inclusive) or None for all of it. The values at the start are always those of
             the whole episode.
-        seed: of the initial weights and of the batches.
+        seed: of the initial weights, the batches and the noise.
         steps: gradient steps of Adam.
         batch_size: rows a step.
         lr: learning rate.
@@ -82,6 +83,10 @@ def train(
         hidden: widths of the hidden layers, ReLU; the output is a tanh.
         std_floor: least standard deviation to divide by, m: a table's height hardly varies, and
             must not be blown up.
+        start_jitter_m: standard deviation of the noise, drawn anew for each row of a batch, on
+            where the objects were at the start, m; 0: none. The exact start is a fingerprint of
+            its episode: without noise the network learns by heart how fast and how slanted each
+            episode went, and strays from its path on starts that it has not seen.
         variant: key of `policy_node.observation.VARIANTS`.
         action_scale: command that is an output of 1; see `ActionSpec`.
         selection: name and hash of the manifest, for the card.
@@ -92,7 +97,7 @@ def train(
             cannot be used, their topic maps differ, or the loss is not finite (naming the step).
     """
     started_s = time.perf_counter()
-    _check_settings(seed, steps, batch_size, lr, weight_decay, hidden, std_floor)
+    _check_settings(seed, steps, batch_size, lr, weight_decay, hidden, std_floor, start_jitter_m)
     chosen = _sorted(episodes)
     # Without phases the check says what is missing, and where.
     spec = ObservationSpec(variant, chosen[0][0].phase_labels or PHASES)
@@ -112,6 +117,8 @@ def train(
             network,
             torch.from_numpy(standardise(obs, mean, std)),
             torch.from_numpy(targets.astype(np.float32)),
+            # Of standardised columns, by noise of standard deviation 1.
+            torch.from_numpy((start_jitter_m * spec.start_effect / std).astype(np.float32)),
             seed=seed,
             steps=steps,
             batch_size=batch_size,
@@ -141,6 +148,7 @@ def train(
         lr=lr,
         weight_decay=weight_decay,
         std_floor=std_floor,
+        start_jitter_m=start_jitter_m,
         clipped_fraction=n_clipped / len(obs),
         curve=curve,
         seconds=seconds,
@@ -186,6 +194,7 @@ def _check_settings(
     weight_decay: float,
     hidden: tuple[int, ...],
     std_floor: float,
+    start_jitter_m: float,
 ) -> None:
     for name, value in (
         ("steps", steps),
@@ -197,7 +206,8 @@ def _check_settings(
     for name, number in (("lr", lr), ("std_floor", std_floor)):
         if not number > 0.0:
             raise PolicyError(f"training: {name} is {number}, expected more than 0")
-    for name, number in (("seed", seed), ("weight_decay", weight_decay)):
+    at_least_zero = {"seed": seed, "weight_decay": weight_decay, "start_jitter_m": start_jitter_m}
+    for name, number in at_least_zero.items():
         if not number >= 0:
             raise PolicyError(f"training: {name} is {number}, expected 0 or more")
 
@@ -246,6 +256,7 @@ def _fit(
     network: torch.nn.Sequential,
     obs: torch.Tensor,
     targets: torch.Tensor,
+    jitter: torch.Tensor,
     *,
     seed: int,
     steps: int,
@@ -260,7 +271,8 @@ def _fit(
         network: to train.
         obs: (N, D) float32, standardised.
         targets: (N, 4) float32.
-        seed: of the batches.
+        jitter: (S, D) float32, what noise of S values with standard deviation 1 adds to obs.
+        seed: of the batches and the noise.
         steps: gradient steps.
         batch_size: rows a step.
         lr: learning rate.
@@ -276,10 +288,12 @@ def _fit(
     for first in range(0, steps, CURVE_EVERY):
         n = min(CURVE_EVERY, steps - first)
         picks = torch.randint(len(obs), (n, batch_size), generator=draw)
+        noise = torch.randn(n, batch_size, len(jitter), generator=draw)
         total = 0.0
         for k in range(n):
             pick = picks[k]
-            loss = torch.nn.functional.mse_loss(network(obs[pick]), targets[pick])
+            seen = torch.addmm(obs[pick], noise[k], jitter)
+            loss = torch.nn.functional.mse_loss(network(seen), targets[pick])
             value = loss.item()
             if not math.isfinite(value):
                 raise PolicyError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,6 +23,7 @@ Command = tuple[list[float], float]
 Script = Generator[bool, None, Command]
 
 _REPEAT_S = 0.5
+_CHECK_S = 1.0
 
 
 class AbortedError(Exception):
@@ -40,18 +41,18 @@ class Commands:
         """Forget everything: another episode begins."""
         self._newest: dict[str, tuple[int, Any]] = {}
         self._arrived_s = 0.0
-        self._stamps: set[int] = set()
+        self._stamps: dict[str, set[int]] = {topic: set() for topic in COMMAND_TOPICS}
 
     def take(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Note a message."""
         self._newest[topic] = (stamp_ns, message)
         self._arrived_s = time.monotonic()
-        if topic == COMMAND_TOPICS[0]:
-            self._stamps.add(stamp_ns)
+        self._stamps[topic].add(stamp_ns)
 
     def accept(self, stamp_ns: int) -> None:
-        """Note a command that did not come as a message."""
-        self._stamps.add(stamp_ns)
+        """Note a command that did not come as messages."""
+        for stamps in self._stamps.values():
+            stamps.add(stamp_ns)
 
     def missing(self, stamp_ns: int) -> list[str]:
         """Command topics that have not answered the observation of a stamp."""
@@ -62,9 +63,12 @@ class Commands:
         whole = len(self._newest) == len(COMMAND_TOPICS)
         return whole and time.monotonic() - self._arrived_s <= timeout_s
 
-    def count(self, start_ns: int, end_ns: int) -> int:
-        """Number of stamps in a window."""
-        return sum(start_ns <= stamp <= end_ns for stamp in self._stamps)
+    def counts(self, start_ns: int, end_ns: int) -> dict[str, int]:
+        """Number of stamps in a window, by topic."""
+        return {
+            topic: sum(start_ns <= stamp <= end_ns for stamp in stamps)
+            for topic, stamps in self._stamps.items()
+        }
 
     @property
     def newest(self) -> Command:
@@ -137,7 +141,12 @@ class Driver:
     """
 
     def __init__(
-        self, env: LiberoEnv, out: SimPublishers, commands: Commands, settings: Mapping[str, Any]
+        self,
+        env: LiberoEnv,
+        out: SimPublishers,
+        commands: Commands,
+        settings: Mapping[str, Any],
+        announced: Callable[[str], Iterator[bool]],
     ) -> None:
         """Make a driver.
 
@@ -146,11 +155,14 @@ class Driver:
             out: the node's publishers.
             commands: filled by the node's subscriptions.
             settings: the node's parameters.
+            announced: yields until who is waited for has taken notice of a started episode.
         """
         self._env = env
         self._out = out
         self._commands = commands
         self._p = settings
+        self._announced = announced
+        self._checked_s = 0.0
         self.reset_wanted = False
         # Stamps begin at the wall's time and never go back, not at a reset either.
         self._stamp_ns = time.time_ns()
@@ -170,6 +182,8 @@ class Driver:
         run = Run(new_episode_id(), name, plan, self._stamp_ns, controller)
         try:
             self._out.event(EpisodeEvent(run.id, name, "started", run.start_ns))
+            yield from self._announced(run.id)
+            run.began_s = time.monotonic()
             while run.executed < limit:
                 self._stamp_ns = run.start_ns + run.executed * period_ns
                 phase = tracker.update(observation)
@@ -220,8 +234,11 @@ class Driver:
                 repeated_s = now_s
                 self._out.observation(self._stamp_ns, observation, tracker, run.id)
             yield False
-        if run.executed == 0 and (strangers := self._out.several_commanders()):
-            raise AbortedError(f"commands come from {strangers}: stop all but one")
+        now_s = time.monotonic()
+        if run.executed == 0 or now_s - self._checked_s > _CHECK_S:
+            self._checked_s = now_s
+            if strangers := self._out.several_commanders():
+                raise AbortedError(f"commands come from {strangers}: stop all but one")
         return self._commands.newest
 
     def _paced(self, run: Run) -> Iterator[bool]:
@@ -234,8 +251,10 @@ class Driver:
     def _end(self, run: Run) -> EpisodeEvent:
         """How an episode ended; only what was executed belongs to it."""
         end_ns = run.start_ns + max(0, run.executed - 1) * self._env.control_period_ns
-        counts = dict.fromkeys(self._out.observation_topics, run.executed)
-        counts |= dict.fromkeys(COMMAND_TOPICS, self._commands.count(run.start_ns, end_ns))
+        # The first observation is in the window even if no command for it was executed.
+        observed = run.executed or int(bool(run.stage))
+        counts = dict.fromkeys(self._out.observation_topics, observed)
+        counts |= self._commands.counts(run.start_ns, end_ns)
         kind, reason = ("aborted", f"aborted: {run.reason}") if run.reason else ("ended", "")
         return EpisodeEvent(
             run.id,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +77,7 @@ class SimNode(Node):
         self.get_logger().info(f"LIBERO and {len(starts)} starts ready in {ready_s:.1f} s")
         self._out = SimPublishers(self, self._env, owner=p["episodes"] > 0, expert=self._expert)
         self._commands = Commands()
-        self._driver = Driver(self._env, self._out, self._commands, p)
+        self._driver = Driver(self._env, self._out, self._commands, p, self._announced)
         self._recorder: dict[str, str] = {}
         if not self._expert:
             for topic, kind in zip(COMMAND_TOPICS, (TwistStamped, JointState), strict=True):
@@ -124,12 +124,9 @@ class SimNode(Node):
 
     def _play(self) -> Generator[bool, None, None]:
         """All episodes; a generator that yields to the executor, True to go on at once."""
-        reported_s = time.monotonic()
-        while missing := [n for n in self._p["wait_for"] if not self._out.is_matched(n)]:
-            if time.monotonic() - reported_s > _REPORT_S:
-                reported_s = time.monotonic()
-                self.get_logger().info(f"waiting for {', '.join(missing)}")
-            yield False
+        yield from self._until_none(
+            lambda: [n for n in self._p["wait_for"] if not self._out.is_matched(n)]
+        )
         number = self._p["first_number"]
         while True:
             for plan in self._plans:
@@ -137,18 +134,38 @@ class SimNode(Node):
                 episode = yield from self._driver.run(plan, self._starts[plan.start], name)
                 number += 1
                 self._report(episode)
-                if "recorder" in self._p["wait_for"]:
-                    while self._recorder.get(episode.id) not in ("closed", "failed"):
-                        yield False
+                yield from self._until_recorder(episode.id, "closed", "failed")
             if self._p["episodes"]:
                 self._out.flush()
                 return
 
+    def _announced(self, episode_id: str) -> Iterator[bool]:
+        return self._until_recorder(episode_id, "recording", "closed", "failed")
+
+    def _until_recorder(self, episode_id: str, *states: str) -> Iterator[bool]:
+        """Wait for the recorder to say that of an episode, if it is in the game."""
+        if self._p["episodes"] and "recorder" in self._p["wait_for"]:
+            yield from self._until_none(
+                lambda: [] if self._recorder.get(episode_id) in states else ["recorder"]
+            )
+
+    def _until_none(self, missing: Callable[[], list[str]]) -> Iterator[bool]:
+        """Wait until nobody is missing, with a line in the log every few seconds."""
+        reported_s = time.monotonic()
+        while names := missing():
+            if time.monotonic() - reported_s > _REPORT_S:
+                reported_s = time.monotonic()
+                self.get_logger().info(f"waiting for {', '.join(names)}")
+            yield False
+
     def _report(self, episode: Run) -> None:
         """Outcome and truth, apart from the data."""
-        log = self.get_logger().error if episode.reason else self.get_logger().info
-        reset = f"reset {1e3 * self._env.reset_s:.0f} ms"
-        log(f"{episode.name}: {episode.reason or 'ended'} ({episode.executed} steps, {reset})")
+        steps = f"{episode.executed} steps, reset {1e3 * self._env.reset_s:.0f} ms"
+        # rclpy refuses a line of code that logs with two severities.
+        if episode.reason:
+            self.get_logger().error(f"{episode.name}: {episode.reason} ({steps})")
+        else:
+            self.get_logger().info(f"{episode.name}: ended ({steps})")
         level = OK if episode.outcome == "succeeded" else ERROR
         self._out.outcome(Status(level, episode.name, episode.outcome, episode.id))
         if self._dataset is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -13,6 +12,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from curation_ros.core.status import EpisodeEvent, Status, event_to_status, phase_to_status
+from curation_ros.nodes.matching import Matching
 from curation_ros.nodes.messages import (
     array_to_ros,
     joints_to_ros,
@@ -26,7 +26,6 @@ from sim_node.phases import PhaseTracker
 
 COMMAND_TOPICS = ("command/twist", "command/gripper")
 GRIPPER_JOINT = "gripper"
-_SETTLED_S = 0.5
 _ACKNOWLEDGED = Duration(seconds=5)
 
 
@@ -62,7 +61,7 @@ class SimPublishers:
             "phase",
             *(f"objects/{name}/pose" for name in env.object_names),
         )
-        self._seen: dict[str, tuple[float, frozenset[str]]] = {}
+        self._matching = Matching(node)
 
     def observation(
         self, stamp_ns: int, o: Observation, tracker: PhaseTracker, episode_id: str
@@ -93,11 +92,14 @@ class SimPublishers:
         self._gripper.publish(joints_to_ros([GRIPPER_JOINT], [gripper], [0.0], [0.0], stamp_ns))
 
     def event(self, event: EpisodeEvent) -> None:
-        """Publish an event of an episode; `started` is delivered before anything follows it."""
+        """Publish an event of an episode.
+
+        Nobody waits here until it is acknowledged: a writer asks for acknowledgements every 3 s
+        (Fast DDS's heartbeat). What follows goes the same way and overtakes it only where a
+        packet is lost; `wait_for` the recorder to be sure.
+        """
         if self._episode is not None:
             self._episode.publish(array_to_ros([event_to_status(event)], event.start_ns))
-            if event.event == "started":
-                self._episode.wait_for_all_acked(_ACKNOWLEDGED)
 
     def outcome(self, status: Status) -> None:
         """Publish an outcome, for evaluation only."""
@@ -120,25 +122,6 @@ class SimPublishers:
                 publisher.wait_for_all_acked(_ACKNOWLEDGED)
 
     def is_matched(self, node_name: str) -> bool:
-        """Whether a node is there, with all its subscriptions to our topics.
-
-        Endpoints are discovered one by one: they count as complete when the graph has shown the
-        same ones for half a second, `episode` among them.
-        """
-        found = self._node.get_node_names_and_namespaces()
-        namespaces = [space for name, space in found if name == node_name]
-        if not namespaces:
-            return False
-        try:
-            topics = self._node.get_subscriber_names_and_types_by_node(node_name, namespaces[0])
-        except RuntimeError:  # gone again (rclpy raises its own class of it)
-            return False
-        names = frozenset(name for name, _ in topics)
-        now_s = time.monotonic()
-        since_s, before = self._seen.get(node_name, (now_s, frozenset()))
-        if names != before:
-            self._seen[node_name] = (now_s, names)
-            return False
-        wanted = self._node.resolve_topic_name("episode")
-        owned = self._episode is None or wanted in names
-        return owned and now_s - since_s > _SETTLED_S
+        """Whether a node is there, with all its subscriptions, to `episode` too if it is ours."""
+        topics = [] if self._episode is None else [self._episode.topic_name]
+        return self._matching.is_complete(node_name, topics)

@@ -23,6 +23,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="relative",
         help="observations: relative (no finger positions) or fingers (as the paper has them)",
     )
+    parser.add_argument(
+        "--start-jitter-m",
+        type=float,
+        default=0.0,
+        help="noise on the start positions of bowl and plate while training, m; 0 is the paper's "
+        "recipe, 0.004 makes few demonstrations go further",
+    )
     parser.add_argument("--report", type=Path, help="file that gets a line of steps now and then")
     parser.add_argument("--out", type=Path, help="folder of the policy; default: in the dataset")
 
@@ -50,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
             seed=args.seed,
             steps=args.steps,
             variant=args.variant,
+            start_jitter_m=args.start_jitter_m,
             selection=(manifest.name, digest),
             progress=show,
         )

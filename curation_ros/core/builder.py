@@ -84,7 +84,8 @@ class _Track:
         values = np.array([index.get(str(text), -1.0) for text in column])
         for text, value, sample in zip(column, values, batch, strict=True):
             if value < 0:
-                self.unknown.setdefault(str(text), sample.stamp_ns)
+                first_ns = self.unknown.get(str(text), sample.stamp_ns)
+                self.unknown[str(text)] = min(first_ns, sample.stamp_ns)
         return values
 
     def ordered(self, start_ns: int, end_ns: int) -> _Ordered:
@@ -241,8 +242,10 @@ class EpisodeBuilder:
             valid = index >= 0
         values[valid] = ordered.values[index[valid]][:, columns]
         if spec.interpolate and valid.any():
+            # Offsets: as float64, stamps of today are 256 ns apart.
+            at, known = clock[valid] - self.start_ns, stamps - self.start_ns
             for k, column in enumerate(columns):
-                values[valid, k] = np.interp(clock[valid], stamps, ordered.values[:, column])
+                values[valid, k] = np.interp(at, known, ordered.values[:, column])
         return values, valid
 
     def _topic_findings(

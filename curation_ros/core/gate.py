@@ -21,19 +21,27 @@ class Window:
     ended: EpisodeEvent | None = None
     deadline_s: float | None = None
     stamps: dict[str, set[int]] = field(default_factory=dict)
-    latest_ns: dict[str, int] = field(default_factory=dict)
+    newest_ns: dict[str, int] = field(default_factory=dict)
 
     def holds(self, stamp_ns: int) -> bool:
         """Whether a stamp lies in the window, as far as it is known."""
         end = self.ended.end_ns if self.ended is not None else None
         return self.started.start_ns <= stamp_ns and (end is None or stamp_ns <= end)
 
+    def note(self, sample: Sample) -> None:
+        """Take note of a sample that belongs to the episode."""
+        self.stamps.setdefault(sample.topic, set()).add(sample.stamp_ns)
+        self.newest_ns[sample.topic] = sample.stamp_ns
+
     def counts(self) -> dict[str, int]:
         """Distinct stamps of each topic in the window."""
-        return {
-            topic: sum(1 for stamp in stamps if self.holds(stamp))
-            for topic, stamps in self.stamps.items()
-        }
+        return {topic: len(stamps) for topic, stamps in self.stamps.items()}
+
+    def end(self, event: EpisodeEvent, deadline_s: float) -> None:
+        """Take the end: what came after it does not belong to the window."""
+        self.ended, self.deadline_s = event, deadline_s
+        for topic, stamps in self.stamps.items():
+            self.stamps[topic] = {stamp for stamp in stamps if self.holds(stamp)}
 
     def missing(self, topics: Iterable[str]) -> list[str]:
         """Topics that have neither passed the end stamp nor reached their count."""
@@ -43,7 +51,7 @@ class Window:
         return [
             topic
             for topic in topics
-            if self.latest_ns.get(topic, -1) < self.ended.end_ns
+            if self.newest_ns.get(topic, -1) < self.ended.end_ns
             and (topic not in expected or arrived.get(topic, 0) < expected[topic])
         ]
 
@@ -87,7 +95,10 @@ class EpisodeGate:
         self.drain_timeout_s = drain_timeout_s
         self._windows: dict[str, Window] = {}
         self._closed: deque[tuple[EpisodeEvent, int]] = deque(maxlen=8)
-        self._before: dict[str, deque[Sample]] = {topic: deque() for topic in self.topics}
+        # The newest samples of each topic, and the episode that has each.
+        self._before: dict[str, deque[tuple[Sample, str | None]]] = {
+            topic: deque() for topic in self.topics
+        }
 
     @property
     def open_ids(self) -> tuple[str, ...]:
@@ -102,27 +113,30 @@ class EpisodeGate:
         """Take an event of the episode's owner.
 
         Args:
-            event: as received; a repeated `started` (a latched topic) changes nothing, an end
-                without a start is ignored.
+            event: as received; a repeated `started` (a latched topic) changes nothing, unless an
+                episode is played again; an end without a start is ignored.
             now_s: any monotonic clock.
 
         Returns:
             The buffered samples that belong to an episode that starts, in arrival order a topic.
         """
         if event.event == "started":
-            known = event.id in self._windows or any(e.id == event.id for e, _ in self._closed)
-            if known:
+            has_closed = any(e.id == event.id for e, _ in self._closed)
+            if event.id in self._windows or (has_closed and event.source != "replay"):
                 return []
             window = Window(event)
+            early = []
+            for kept in self._before.values():
+                for k, (sample, owner) in enumerate(kept):
+                    if window.holds(sample.stamp_ns) and not self._is_taken(sample, owner):
+                        window.note(sample)
+                        early.append(sample)
+                        kept[k] = (sample, event.id)
             self._windows[event.id] = window
-            early = [s for kept in self._before.values() for s in kept if window.holds(s.stamp_ns)]
-            for sample in early:
-                self._note(window, sample)
             return early
         open_window = self._windows.get(event.id)
         if open_window is not None and open_window.ended is None:
-            open_window.ended = event
-            open_window.deadline_s = now_s + self.drain_timeout_s
+            open_window.end(event, now_s + self.drain_timeout_s)
         return []
 
     def push(self, sample: Sample) -> str | None:
@@ -132,15 +146,15 @@ class EpisodeGate:
         """
         owner = None
         for episode_id, window in reversed(self._windows.items()):
-            latest = window.latest_ns.get(sample.topic, -1)
-            window.latest_ns[sample.topic] = max(latest, sample.stamp_ns)
+            # The newest, not the highest: what is left of a clock that went back passes no end.
+            window.newest_ns[sample.topic] = sample.stamp_ns
             if owner is None and window.holds(sample.stamp_ns):
-                window.stamps.setdefault(sample.topic, set()).add(sample.stamp_ns)
+                window.note(sample)
                 owner = episode_id
         before = self._before[sample.topic]
-        before.append(sample)
+        before.append((sample, owner))
         horizon = sample.stamp_ns - int(self.max_gap_s * NS_PER_S)
-        while before and (before[0].stamp_ns < horizon or before[0].stamp_ns > sample.stamp_ns):
+        while not horizon <= before[0][0].stamp_ns <= sample.stamp_ns:
             before.popleft()
         return owner
 
@@ -165,8 +179,16 @@ class EpisodeGate:
             done.append(Closed(window.ended, window.counts(), tuple(missing)))
         return done
 
-    @staticmethod
-    def _note(window: Window, sample: Sample) -> None:
-        window.stamps.setdefault(sample.topic, set()).add(sample.stamp_ns)
-        latest = window.latest_ns.get(sample.topic, -1)
-        window.latest_ns[sample.topic] = max(latest, sample.stamp_ns)
+    def _is_taken(self, sample: Sample, owner: str | None) -> bool:
+        """Whether a sample is another episode's for good: its stamp may fit into several.
+
+        It does where the clock went back between episodes, or one is played again.
+        """
+        for episode_id, window in self._windows.items():
+            if episode_id == owner:
+                known = window.ended is not None and window.ended.end_ns is not None
+                return known and window.holds(sample.stamp_ns)
+        for event, start_ns in self._closed:
+            if event.id == owner:
+                return event.end_ns is None or start_ns <= sample.stamp_ns <= event.end_ns
+        return False

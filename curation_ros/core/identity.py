@@ -40,8 +40,10 @@ def resolve_prefix(prefix: str, names_by_id: Iterable[tuple[str, str]]) -> str:
     """
     pairs = list(names_by_id)
     wanted = prefix.strip()
-    exact = {i for i, name in pairs if wanted in (i, name)}
-    found = exact or {i for i, _ in pairs if wanted and i.startswith(wanted.lower())}
+    found: set[str] = set()
+    if wanted:
+        found = {i for i, name in pairs if wanted in (i, name)}
+        found = found or {i for i, _ in pairs if i.startswith(wanted.lower())}
     if len(found) == 1:
         return found.pop()
     if not found:

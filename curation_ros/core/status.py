@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from curation_ros.core.errors import EpisodeError
 from curation_ros.core.findings import FINDINGS, Finding
@@ -52,12 +52,19 @@ class EpisodeEvent:
     reason: str = ""
 
 
+def _stamp(raw: Any) -> int:
+    stamp_ns = int(raw)
+    if not 0 <= stamp_ns < 1 << 63:
+        raise ValueError(f"stamp {stamp_ns} is not from 0 to 2**63")
+    return stamp_ns
+
+
 def event_to_status(event: EpisodeEvent) -> Status:
     """Write an episode event."""
     values = {"start_stamp": str(event.start_ns), "source": event.source}
     if event.end_ns is not None:
         values["end_stamp"] = str(event.end_ns)
-    values |= {_COUNT + topic: str(n) for topic, n in sorted(event.counts.items())}
+    values |= counts_to_values(event.counts)
     if event.reason:
         values["reason"] = event.reason
     level = ERROR if event.event == "aborted" else OK
@@ -71,7 +78,7 @@ def event_from_status(status: Status) -> EpisodeEvent:
         EpisodeError: if it is none, naming what was found.
     """
     kind = status.message
-    if kind not in ("started", "ended", "aborted") or not status.hardware_id:
+    if kind not in get_args(EventKind) or not status.hardware_id:
         raise EpisodeError(
             f"episode event {kind!r} of {status.hardware_id!r}: expected started, ended or "
             "aborted, and an episode id"
@@ -82,13 +89,9 @@ def event_from_status(status: Status) -> EpisodeEvent:
             id=status.hardware_id,
             name=status.name,
             event=kind,  # type: ignore[arg-type]  # checked above
-            start_ns=int(status.values["start_stamp"]),
-            end_ns=None if end is None else int(end),
-            counts={
-                k.removeprefix(_COUNT): int(v)
-                for k, v in status.values.items()
-                if k.startswith(_COUNT)
-            },
+            start_ns=_stamp(status.values["start_stamp"]),
+            end_ns=None if end is None else _stamp(end),
+            counts=counts_from_status(status),
             source=status.values.get("source", "live"),
             reason=status.values.get("reason", ""),
         )
@@ -97,6 +100,22 @@ def event_from_status(status: Status) -> EpisodeEvent:
             f"episode event of {status.hardware_id}: {type(err).__name__} {err} "
             f"in {dict(status.values)}"
         ) from err
+
+
+def counts_to_values(counts: Mapping[str, int]) -> dict[str, str]:
+    """Write numbers of samples by topic."""
+    return {_COUNT + topic: str(n) for topic, n in sorted(counts.items())}
+
+
+def counts_from_status(status: Status) -> dict[str, int]:
+    """Read numbers of samples by topic.
+
+    Raises:
+        ValueError: if one is no number.
+    """
+    return {
+        k.removeprefix(_COUNT): int(v) for k, v in status.values.items() if k.startswith(_COUNT)
+    }
 
 
 def event_to_json(event: EpisodeEvent) -> dict[str, Any]:
@@ -121,17 +140,19 @@ def event_from_json(raw: Mapping[str, Any]) -> EpisodeEvent:
     """
     try:
         end = raw["end_stamp"]
+        if raw["event"] not in get_args(EventKind) or not raw["id"]:
+            raise ValueError(f"event {raw['event']!r} of id {raw['id']!r}")
         return EpisodeEvent(
             id=str(raw["id"]),
             name=str(raw["name"]),
             event=raw["event"],
-            start_ns=int(raw["start_stamp"]),
-            end_ns=None if end is None else int(end),
+            start_ns=_stamp(raw["start_stamp"]),
+            end_ns=None if end is None else _stamp(end),
             counts={str(k): int(v) for k, v in raw["counts"].items()},
             source=str(raw["source"]),
             reason=str(raw.get("reason", "")),
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as err:
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as err:
         raise EpisodeError(f"episode record: {type(err).__name__} {err} in {raw!r:.200}") from err
 
 

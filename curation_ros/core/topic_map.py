@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -117,10 +118,10 @@ class TopicMap:
         """The map with these fields alone, for who needs no others; its clock stays if it is kept.
 
         Raises:
-            ConfigError: if a name is no field.
+            ConfigError: if a name is no field, or there is none.
         """
         wanted = list(names)
-        for name in wanted:
+        for name in wanted or [""]:
             if name not in self.fields:
                 raise ConfigError(f"topic map: no field {name!r}; it has {', '.join(self.fields)}")
         kept = {k: v for k, v in self.fields.items() if k in wanted}
@@ -166,11 +167,32 @@ class TopicMap:
 
 
 def _reject_unknown(found: Mapping[str, Any], known: set[str], where: str) -> None:
-    extra = sorted(set(found) - known)
+    extra = sorted(set(found) - known, key=str)
     if extra:
         raise ConfigError(
             f"{where}: unknown key {extra[0]!r}; known are {', '.join(sorted(known))}"
         )
+
+
+def _texts(raw: object, what: str) -> tuple[str, ...]:
+    """A list of texts; where there is nothing, an empty one."""
+    if raw is None:
+        return ()
+    if isinstance(raw, Sequence) and not isinstance(raw, str):
+        texts = tuple(raw)
+        if all(isinstance(text, str) for text in texts):
+            return texts
+    raise ConfigError(f"{what} must be a list of texts, found {raw!r}")
+
+
+def _number(raw: Any, what: str) -> float:
+    try:
+        value = float("nan") if isinstance(raw, bool) else float(raw)
+    except (TypeError, ValueError, OverflowError):
+        value = float("nan")
+    if not math.isfinite(value):
+        raise ConfigError(f"{what} must be a number, found {raw!r}")
+    return value
 
 
 def _field_spec(name: str, raw: object, where: str) -> FieldSpec:
@@ -186,39 +208,50 @@ def _field_spec(name: str, raw: object, where: str) -> FieldSpec:
         raise ConfigError(f"{here}: role {raw['role']!r} is none of {', '.join(ROLES)}")
     if raw.get("stamp", "header") not in STAMPS:
         raise ConfigError(f"{here}: stamp {raw['stamp']!r} is none of {', '.join(STAMPS)}")
-    values = raw["values"]
-    if isinstance(values, str) or not all(isinstance(v, str) for v in values):
-        raise ConfigError(f"{here}: 'values' must be a list of paths, found {values!r}")
+    values = _texts(raw["values"], f"{here}: 'values'")
+    labels = _texts(raw.get("labels"), f"{here}: 'labels'")
+    if not isinstance(raw.get("interpolate", False), bool):
+        found = raw["interpolate"]
+        raise ConfigError(f"{here}: 'interpolate' must be true or false, found {found!r}")
     parts = str(raw["type"]).split("/")
     if len(parts) != 3 or parts[1] != "msg":
         raise ConfigError(f"{here}: type {raw['type']!r} is not of the form package/msg/Type")
-    if raw["role"] == "phase" and (not raw.get("labels") or len(values) != 1):
+    if raw["role"] == "phase" and (not labels or len(values) != 1):
         raise ConfigError(f"{here}: a phase needs 'labels' and exactly one value")
     return FieldSpec(
         name=name,
         topic=str(raw["topic"]),
         type=str(raw["type"]),
         role=str(raw["role"]),
-        values=tuple(values),
+        values=values,
         unit=str(raw.get("unit", "")),
-        labels=tuple(str(x) for x in raw.get("labels", ())),
+        labels=labels,
         stamp=str(raw.get("stamp", "header")),
-        interpolate=bool(raw.get("interpolate", False)),
+        interpolate=raw.get("interpolate", False),
     )
 
 
-def _gripper_spec(
-    raw: Mapping[str, Any], fields: Mapping[str, FieldSpec], where: str
-) -> GripperSpec:
+def _gripper_spec(raw: object, fields: Mapping[str, FieldSpec], where: str) -> GripperSpec:
     here = f"{where}: gripper"
+    if not isinstance(raw, Mapping):
+        raise ConfigError(f"{here} must be a mapping, found {raw!r}")
     _reject_unknown(raw, {"field", "opens", "kind", "open_value", "closed_value", "fingers"}, here)
-    spec = GripperSpec(**raw)
+    if "field" not in raw:
+        raise ConfigError(f"{here}: 'field' is missing")
+    numbers = {
+        k: _number(raw[k], f"{here}: {k}")
+        for k in ("opens", "open_value", "closed_value")
+        if k in raw
+    }
+    if numbers.get("opens", -1) not in (-1, 1):
+        raise ConfigError(f"{here}: opens must be -1 or 1, found {raw['opens']!r}")
+    texts = {k: str(raw[k] or "") for k in ("field", "kind", "fingers") if k in raw}
+    spec = GripperSpec(**{**texts, **numbers})  # type: ignore[arg-type]  # checked above
+    spec = replace(spec, opens=int(spec.opens))
     if spec.field not in fields or fields[spec.field].role != "gripper":
         raise ConfigError(f"{here}: field {spec.field!r} is not a field with role gripper")
     if spec.fingers and spec.fingers not in fields:
         raise ConfigError(f"{here}: fingers {spec.fingers!r} is not a field of this map")
-    if spec.opens not in (-1, 1):
-        raise ConfigError(f"{here}: opens must be -1 or 1, found {spec.opens!r}")
     if spec.kind not in ("binary", "continuous"):
         raise ConfigError(f"{here}: kind must be binary or continuous, found {spec.kind!r}")
     if (spec.open_value - spec.closed_value) * spec.opens <= 0:
@@ -257,26 +290,36 @@ def topic_map_from_json(raw: object, where: str = "topic map") -> TopicMap:
     clocks = [s.name for s in fields.values() if s.role == "clock"]
     clocks += [s.name for s in fields.values() if s.role == "effector"]
     clock = str(raw.get("clock") or (clocks[0] if clocks else ""))
-    if clock not in fields:
+    if clock and clock not in fields:
+        raise ConfigError(f"{where}: clock {clock!r} is not a field of this map")
+    if not clock:
         raise ConfigError(
             f"{where}: no clock: give a field the role clock or effector, or name one as 'clock'"
         )
-    for key in ("state", "action"):
-        for column in raw.get(key, ()):
-            if str(column).removesuffix(AT_START) not in fields:
+    columns = {key: _texts(raw.get(key), f"{where}: {key}") for key in ("state", "action")}
+    for key, names in columns.items():
+        for column in names:
+            if column.removesuffix(AT_START) not in fields:
                 raise ConfigError(f"{where}: {key} names {column!r}, which is not a field")
     gripper = raw.get("gripper")
-    max_gap_s = float(raw.get("max_gap_s", 0.25))
+    max_gap_s = _number(raw.get("max_gap_s", 0.25), f"{where}: max_gap_s")
     if not max_gap_s > 0:
-        raise ConfigError(f"{where}: max_gap_s must be positive, found {max_gap_s}")
+        raise ConfigError(f"{where}: max_gap_s must be positive, found {raw['max_gap_s']!r}")
+    command = raw.get("command") or {}
+    if not isinstance(command, Mapping):
+        raise ConfigError(f"{where}: command must be a mapping, found {command!r}")
+    try:
+        json.dumps(command)
+    except (TypeError, ValueError) as err:
+        raise ConfigError(f"{where}: command must be texts and numbers: {err}") from err
     return TopicMap(
         fields=fields,
         clock=clock,
         gripper=None if gripper is None else _gripper_spec(gripper, fields, where),
-        state=tuple(str(c) for c in raw.get("state", ())),
-        action=tuple(str(c) for c in raw.get("action", ())),
+        state=columns["state"],
+        action=columns["action"],
         max_gap_s=max_gap_s,
-        command=dict(raw.get("command", {})),
+        command=dict(command),
     )
 
 
@@ -290,6 +333,6 @@ def read_topic_map(path: Path) -> TopicMap:
         raw = yaml.safe_load(path.read_text())
     except OSError as err:
         raise ConfigError(f"topic map {path}: {err.strerror}") from err
-    except (yaml.YAMLError, UnicodeDecodeError) as err:
+    except (yaml.YAMLError, ValueError) as err:  # an impossible date is a ValueError
         raise ConfigError(f"topic map {path} is not YAML: {str(err).splitlines()[0]}") from err
     return topic_map_from_json(raw, str(path))

@@ -21,14 +21,14 @@ from curation_ros.configuration import (
 )
 from curation_ros.core.decisions import Decision
 from curation_ros.core.errors import CurationError
-from curation_ros.core.status import decision_to_status, event_from_status
+from curation_ros.core.status import counts_to_values, decision_to_status, event_from_status
 from curation_ros.core.stream import Sample
 from curation_ros.curating import Decided, LiveCuration
 from curation_ros.dataset import Dataset
 from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import array_to_ros, single_from_ros, status_to_ros
 from curation_ros.nodes.parameters import Parameter, declare
-from curation_ros.nodes.qos import DECISIONS, EVENTS, LATCHED
+from curation_ros.nodes.qos import DECISIONS, DRAIN_S, EVENTS, LATCHED
 from curation_ros.nodes.spinning import run
 from curation_ros.nodes.subscriptions import MappedSubscriptions
 from curation_ros.selecting import save_selection
@@ -40,7 +40,7 @@ PARAMETERS = (
     Parameter("config", "", "YAML file of scorers and rule; empty: config/curation.yaml"),
     Parameter("scorers", (), "scorers to compute; empty: those of the config"),
     Parameter("rule", "", "decision rule; empty: that of the config"),
-    Parameter("drain_timeout_s", 3.0, "patience for late samples after an end, s", 0.0, 60.0),
+    Parameter("drain_timeout_s", DRAIN_S, "patience for late samples after an end, s", 0.0, 60.0),
 )
 _KEPT = 200
 
@@ -71,6 +71,7 @@ class Curator(Node):
         self.create_service(SelfTest, "~/decisions", self._decisions)
         self.create_service(Trigger, "~/curate", self._curate)
         self._health = Health(self)
+        self._running = ""
         for line in curation.describe().splitlines():
             self.get_logger().info(line)
 
@@ -93,12 +94,9 @@ class Curator(Node):
         status = message.status[0] if message.status else None
         if status is not None and status.message.startswith("closed "):
             try:
-                decision = self._live.bag_closed(status.hardware_id)
+                self._tell(self._live.bag_closed(status.hardware_id))
             except CurationError as err:
                 self.get_logger().error(str(err))
-                return
-            if decision is not None:
-                self._publish(decision)
 
     def _on_override(self, message: KeyValue) -> None:
         verdict, _, reason = message.value.strip().partition(" ")
@@ -137,15 +135,19 @@ class Curator(Node):
             self._tell(self._live.tick(now_s))
         except CurationError as err:
             self.get_logger().error(str(err))
-        if self._health.due(now_s):
-            problems = self._mapped.check() if self._live.gate.open_ids else []
+        running = self._live.running
+        # At once when an episode begins, too: replay waits for that.
+        if self._health.due(now_s) or running != self._running:
+            self._running = running
+            problems = self._mapped.check(running=bool(running))
             if self.count_publishers("episode") > 1:
                 problems.insert(0, "topic episode has two owners: stop one of them")
             values = {"decisions": str(len(self._latencies_ms))}
+            values |= counts_to_values(self._live.counts())
             if self._latencies_ms:
                 middle, worst = np.percentile(list(self._latencies_ms), [50, 99])
                 values |= {"latency_ms_p50": f"{middle:.1f}", "latency_ms_p99": f"{worst:.1f}"}
-            self._health.publish(now_s, problems, values)
+            self._health.publish(now_s, problems, values, running)
         return False
 
     def close(self) -> None:
@@ -155,7 +157,8 @@ class Curator(Node):
         for one in decided:
             began = time.perf_counter()
             self._publish(one.decision)
-            self._latencies_ms.append(1e3 * (one.latency_s + time.perf_counter() - began))
+            if one.latency_s is not None:
+                self._latencies_ms.append(1e3 * (one.latency_s + time.perf_counter() - began))
 
     def _publish(self, d: Decision) -> None:
         status = decision_to_status(

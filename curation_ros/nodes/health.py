@@ -27,12 +27,25 @@ class Health:
         """Whether a second has passed since the last report."""
         return now_s - self._last_s >= _PERIOD_S
 
-    def publish(self, now_s: float, problems: Sequence[str], values: Mapping[str, str]) -> None:
-        """Report."""
+    def publish(
+        self,
+        now_s: float,
+        problems: Sequence[str],
+        values: Mapping[str, str],
+        episode_id: str = "",
+    ) -> None:
+        """Report.
+
+        Args:
+            now_s: time of `due`.
+            problems: what is wrong now, the worst first.
+            values: figures of the node.
+            episode_id: the episode that the figures are about, if one is running.
+        """
         self._last_s = now_s
         level, message = (ERROR, problems[0]) if problems else (OK, "ok")
         status = Status(
-            level, self._node.get_fully_qualified_name().strip("/"), message, "", values
+            level, self._node.get_fully_qualified_name().strip("/"), message, episode_id, values
         )
         stamp_ns = self._node.get_clock().now().nanoseconds
         self._publisher.publish(array_to_ros([status], stamp_ns))

@@ -23,3 +23,6 @@ LATCHED = _profile(10, DurabilityPolicy.TRANSIENT_LOCAL)
 DECISIONS = _profile(200, DurabilityPolicy.TRANSIENT_LOCAL)
 #: Alerts, overrides, diagnostics.
 EVENTS = _profile(50, DurabilityPolicy.VOLATILE)
+#: Patience for samples that are late. What the transport has dropped comes again when Fast DDS
+#: next asks for acknowledgements, every 3 s.
+DRAIN_S = 5.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, KeyValue
@@ -18,6 +19,7 @@ from curation_ros.core.status import (
     OK,
     EpisodeEvent,
     Status,
+    counts_to_values,
     event_from_status,
     event_to_status,
 )
@@ -26,7 +28,7 @@ from curation_ros.dataset import Dataset
 from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import array_to_ros, single_from_ros
 from curation_ros.nodes.parameters import Parameter, declare
-from curation_ros.nodes.qos import EVENTS, LATCHED
+from curation_ros.nodes.qos import DRAIN_S, EVENTS, LATCHED
 from curation_ros.nodes.spinning import run
 from curation_ros.nodes.subscriptions import MappedSubscriptions
 from curation_ros.recording import Notice, RecordedTopic, Recording, recover_partials
@@ -37,9 +39,10 @@ PARAMETERS = (
     Parameter("auto", True, "follow the episode topic; false: driven by ~/start and ~/stop"),
     Parameter("task", "demo", "short names are <task>-<number>, when driven by hand"),
     Parameter("min_free_mb", 500.0, "free space below which no bag is written, MB", 0.0, 1e9),
-    Parameter("drain_timeout_s", 3.0, "patience for late samples after an end, s", 0.0, 60.0),
+    Parameter("drain_timeout_s", DRAIN_S, "patience for late samples after an end, s", 0.0, 60.0),
     Parameter("flush_period_s", 0.1, "at most this much is lost to a kill, s", 0.01, 10.0),
 )
+_STOPPED = "the recorder was stopped"
 
 
 class Recorder(Node):
@@ -60,14 +63,10 @@ class Recorder(Node):
         else:
             self._episode = self.create_publisher(DiagnosticArray, "episode", LATCHED)
         self._mapped = MappedSubscriptions(self, self._map, self._on_sample)
-        topics = {
-            t: RecordedTopic(self._mapped.resolved(t), kind, self._mapped.qos(t))
-            for t, kind in self._map.topics.items()
-        }
         self._recording = Recording(
             self._dataset,
             self._map,
-            topics,
+            self._topics(),
             min_free_mb=p["min_free_mb"],
             drain_timeout_s=p["drain_timeout_s"],
             flush_period_s=p["flush_period_s"],
@@ -82,6 +81,7 @@ class Recorder(Node):
         self._clock_ns = 0
         self._last_id = ""
         self._tell(recover_partials(self._dataset))
+        self._number = 0 if self._auto else self._last_number()
         self._publish(Status(OK, "recorder", "idle", values={"reason": self._free()}))
 
     # --- messages in ------------------------------------------------------------------------
@@ -114,29 +114,46 @@ class Recorder(Node):
         if problem:
             response.message = problem
             return response
-        number = len(list(self._dataset.bags())) + 1
-        name = f"{self._task}-{number:04d}"
+        name = f"{self._task}-{self._number + 1:04d}"
         event = EpisodeEvent(new_episode_id(), name, "started", self._clock_ns + 1)
-        self._by_hand = event
-        self._own(event)
-        response.success = event.id in self._recording.open_ids
-        response.message = json.dumps({"episode": event.id, "name": name})
+        notices = self._recording.event(event, time.monotonic())
+        if event.id in self._recording.open_ids:
+            self._number += 1
+            self._by_hand = event
+            self._publish_event(event)
+            response.success = True
+            response.message = json.dumps({"episode": event.id, "name": name})
+        else:
+            response.message = "; ".join(n.reason for n in notices)
+        self._tell(notices)
         return response
 
     def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        started, self._by_hand = self._by_hand, None
+        started = self._by_hand
         if started is None:
             response.message = "no episode was started by ~/start"
             return response
-        end_ns = max(self._clock_ns, started.start_ns)
-        self._own(EpisodeEvent(started.id, started.name, "ended", started.start_ns, end_ns))
+        self._end(replace(started, event="ended", end_ns=self._end_ns(started)))
         response.success = True
         response.message = json.dumps({"episode": started.id, "name": started.name})
         return response
 
-    def _own(self, event: EpisodeEvent) -> None:
-        self._episode.publish(array_to_ros([event_to_status(event)], self._now()))
+    def _end(self, event: EpisodeEvent) -> None:
+        self._by_hand = None
+        self._publish_event(event)
         self._tell(self._recording.event(event, time.monotonic()))
+
+    def _last_number(self) -> int:
+        named = [name.rpartition("-") for _, name in self._dataset.names()]
+        return max(
+            (int(n) for task, _, n in named if task == self._task and n.isdigit()), default=0
+        )
+
+    def _publish_event(self, event: EpisodeEvent) -> None:
+        self._episode.publish(array_to_ros([event_to_status(event)], self._now()))
+
+    def _end_ns(self, started: EpisodeEvent) -> int:
+        return max(self._clock_ns, started.start_ns)
 
     def _recover(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         notices = recover_partials(self._dataset)
@@ -167,25 +184,39 @@ class Recorder(Node):
         now_s = time.monotonic()
         self._tell(self._recording.tick(now_s))
         if self._health.due(now_s):
-            problems = self._mapped.check() if self._recording.open_ids else []
+            problems = self._mapped.check(running=bool(self._recording.open_ids))
+            self._recording.topics |= self._topics()
             if self.count_publishers("episode") > 1:
                 problems.insert(0, "topic episode has two owners: stop one of them")
             self._health.publish(now_s, problems, {"free": self._free()})
         return False
 
     def close(self) -> None:
-        """Close the open bag as aborted, with all it has."""
-        self._tell(self._recording.abort("the recorder was stopped"))
+        """Close the open bag as aborted, with all it has; who owns the episode says so."""
+        if (started := self._by_hand) is not None:
+            end_ns, reason = self._end_ns(started), f"aborted: {_STOPPED}"
+            self._end(replace(started, event="aborted", end_ns=end_ns, reason=reason))
+        self._tell(self._recording.abort(_STOPPED))
 
     def _tell(self, notices: list[Notice]) -> None:
         for n in notices:
             self._last_id = n.id if n.state == "closed" else self._last_id
             level = ERROR if n.state == "failed" else OK
             values = {"reason": n.reason or self._free()}
-            values |= {f"count/{topic}": str(count) for topic, count in n.counts.items()}
+            values |= counts_to_values(n.counts)
             self._publish(Status(level, n.name, f"{n.state} {n.id}", n.id, values))
-            log = self.get_logger().error if n.state == "failed" else self.get_logger().info
-            log(f"{n.state} {n.name or n.id}{': ' + n.reason if n.reason else ''}")
+            line = f"{n.state} {n.name or n.id}{': ' + n.reason if n.reason else ''}"
+            # rclpy refuses a line of code that logs with two severities.
+            if n.state == "failed":
+                self.get_logger().error(line)
+            else:
+                self.get_logger().info(line)
+
+    def _topics(self) -> dict[str, RecordedTopic]:
+        return {
+            t: RecordedTopic(self._mapped.resolved(t), kind, self._mapped.qos(t))
+            for t, kind in self._map.topics.items()
+        }
 
     def _publish(self, status: Status) -> None:
         self._status.publish(array_to_ros([status], self._now()))

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.duration import Duration
 from rclpy.node import Node
 
 from curation_ros.bags.reader import Bag, episode_event, find_bags, open_bag
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.errors import ConfigError, CurationError
-from curation_ros.core.status import EpisodeEvent, event_to_status
+from curation_ros.core.status import EpisodeEvent, Status, counts_from_status, event_to_status
 from curation_ros.core.stream import NS_PER_S, Sample, playback_order
-from curation_ros.nodes.messages import array_to_ros, single_from_ros
+from curation_ros.nodes.matching import Matching
+from curation_ros.nodes.messages import array_to_ros, status_from_ros
 from curation_ros.nodes.parameters import Parameter, declare
-from curation_ros.nodes.qos import DECISIONS, LATCHED, MAPPED
+from curation_ros.nodes.qos import DECISIONS, EVENTS, LATCHED, MAPPED
 from curation_ros.nodes.spinning import Finished, run
 from curation_ros.nodes.subscriptions import message_type
 
@@ -31,9 +31,10 @@ PARAMETERS = (
         "wait_s", 30.0, "patience for a curator to appear, and for a decision, s", 0.1, 3600.0
     ),
 )
-# The curator's queues hold 1,000 messages a topic; this many are out at most before all are
-# acknowledged, so that none is overwritten.
-_AHEAD = 500
+# The curator's queues hold 1,000 messages a topic. Every so many we look at what it has taken, and
+# go on when no more than that are missing: 500 at most are out. What it has taken is in its health
+# report, every second; DDS acknowledges what lies in a queue, too, and Fast DDS 3 s later.
+_AHEAD = 250
 
 
 class Replay(Node):
@@ -53,7 +54,13 @@ class Replay(Node):
             for topic, kind in self._map.topics.items()
         }
         self._decided: set[str] = set()
-        self.create_subscription(DiagnosticArray, "curator/decision", self._on_decision, DECISIONS)
+        self._progress: dict[str, Status] = {}
+        self._matching = Matching(self)
+        decisions = self.create_subscription(
+            DiagnosticArray, "curator/decision", self._on_decision, DECISIONS
+        )
+        self._decision_topic = decisions.topic_name
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_health, EVENTS)
         self._script = self._play()
 
     def work(self) -> bool:
@@ -67,17 +74,17 @@ class Replay(Node):
         """Nothing to finish: what was published is out."""
 
     def _on_decision(self, message: DiagnosticArray) -> None:
-        self._decided.add(single_from_ros(message).hardware_id)
+        self._decided |= {status.hardware_id for status in message.status}
+
+    def _on_health(self, message: DiagnosticArray) -> None:
+        for status in map(status_from_ros, message.status):
+            self._progress[status.name] = status
 
     def _play(self) -> Iterator[bool]:
         """The script; it yields to the executor, True to be called again at once."""
-        publishers: list[Any] = [self._episode, *self._outputs.values()]
         yield from self._until(
-            lambda: all(p.get_subscription_count() for p in publishers),
-            lambda: (
-                "no curator listens on "
-                + ", ".join(p.topic_name for p in publishers if not p.get_subscription_count())
-            ),
+            self._is_heard,
+            lambda: "no curator listens to episode, " + ", ".join(self._outputs),
         )
         for index, path in enumerate(self._bags, 1):
             try:
@@ -92,8 +99,11 @@ class Replay(Node):
 
     def _play_bag(self, bag: Bag, event: EpisodeEvent, samples: list[Sample]) -> Iterator[bool]:
         self._tell(EpisodeEvent(event.id, event.name, "started", event.start_ns, source="replay"))
-        yield from self._acknowledged()
-        out: Counter[str] = Counter()
+        yield from self._until(
+            lambda: any(self._reports(event.id)),
+            lambda: f"no curator has taken notice of {event.name} within {self._wait_s:g} s",
+        )
+        out: dict[str, set[int]] = {topic: set() for topic in self._outputs}
         began_s = time.monotonic()
         for sample in playback_order(samples):
             if not event.start_ns <= sample.stamp_ns <= (event.end_ns or sample.stamp_ns):
@@ -103,41 +113,45 @@ class Replay(Node):
                 while time.monotonic() - began_s < due_s:
                     yield False
             self._outputs[sample.topic].publish(sample.data)
-            out[sample.topic] += 1
-            if out[sample.topic] == _AHEAD:
-                yield from self._acknowledged()
-                out.clear()
-        yield from self._acknowledged()
+            sent = out[sample.topic]
+            sent.add(sample.stamp_ns)
+            if len(sent) % _AHEAD == 0:
+                yield from self._until(
+                    partial(self._has_taken, event.id, sample.topic, len(sent) - _AHEAD),
+                    lambda: f"no curator keeps up with {event.name}",
+                )
+            # Not faster than one by one through the executor: a burst overruns the transport's
+            # queue, and what is lost there comes again 3 s later.
+            yield True
         self._decided.discard(event.id)
-        self._tell(
-            EpisodeEvent(
-                event.id,
-                event.name,
-                event.event,
-                event.start_ns,
-                event.end_ns,
-                event.counts,
-                "replay",
-                event.reason,
-            )
-        )
+        # Where the owner did not count, we do: so the curator knows when it has everything.
+        played = {topic: len(stamps) for topic, stamps in out.items() if stamps}
+        self._tell(replace(event, source="replay", counts={**played, **event.counts}))
         yield from self._until(
             lambda: event.id in self._decided,
             lambda: f"no decision on {event.name} ({bag.path}) within {self._wait_s:g} s",
         )
 
+    def _is_heard(self) -> bool:
+        """Whether there are curators, and all of them hear us."""
+        infos = self.get_publishers_info_by_topic(self._decision_topic)
+        topics = [p.topic_name for p in (self._episode, *self._outputs.values())]
+        curators = {info.node_name for info in infos}
+        return bool(curators) and all(self._matching.is_complete(c, topics) for c in curators)
+
+    def _has_taken(self, episode_id: str, topic: str, n: int) -> bool:
+        """Whether every curator has taken so many samples of a topic."""
+        return all(counts_from_status(s).get(topic, 0) >= n for s in self._reports(episode_id))
+
+    def _reports(self, episode_id: str) -> list[Status]:
+        """Newest health report of each node that works on an episode."""
+        return [s for s in self._progress.values() if s.hardware_id == episode_id]
+
     def _tell(self, event: EpisodeEvent) -> None:
         stamp_ns = self.get_clock().now().nanoseconds
         self._episode.publish(array_to_ros([event_to_status(event)], stamp_ns))
 
-    def _acknowledged(self) -> Iterator[bool]:
-        """Wait until every subscriber has everything; a slow one is waited for."""
-        moment = Duration(nanoseconds=NS_PER_S // 10)
-        for publisher in (self._episode, *self._outputs.values()):
-            while not publisher.wait_for_all_acked(moment):
-                yield True
-
-    def _until(self, is_true: Any, complaint: Any) -> Iterator[bool]:
+    def _until(self, is_true: Callable[[], bool], complaint: Callable[[], str]) -> Iterator[bool]:
         deadline_s = time.monotonic() + self._wait_s
         while not is_true():
             if time.monotonic() > deadline_s:

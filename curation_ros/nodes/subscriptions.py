@@ -96,16 +96,22 @@ class MappedSubscriptions:
         """Number of publishers of a topic that the graph shows now, at least 1."""
         return max(1, len(self._node.get_publishers_info_by_topic(self.resolved(topic))))
 
-    def check(self) -> list[str]:
-        """Compare the graph with the map; returns what is wrong now, one line a topic.
+    def check(self, *, running: bool) -> list[str]:
+        """Compare the graph with the map; to be called every second, between episodes too.
 
         A topic of another type is named once in the log; where a publisher offers only best
         effort, the subscription is made anew so that it matches.
+
+        Args:
+            running: whether an episode runs: only then is a missing publisher a problem.
+
+        Returns:
+            What is wrong now, one line a topic.
         """
         problems = []
         for topic, expected in self._map.topics.items():
             infos = self._node.get_publishers_info_by_topic(self.resolved(topic))
-            if not infos:
+            if running and not infos:
                 problems.append(f"topic {self.resolved(topic)}: no publisher")
             for info in infos:
                 if info.topic_type != expected:

@@ -60,6 +60,21 @@ def test_columns_hold_what_their_names_say():
     np.testing.assert_array_equal(rows["phase=LIFT"], fields["phase"][:, 0] == 3)
 
 
+@variants
+def test_start_effect_is_what_moving_an_object_changes(variant):
+    spec, values = ObservationSpec(variant), step_values(demonstration(7), 5)
+    before = spec.from_step(values, values)
+    k = 0
+    for name in spec.start_fields:
+        for axis in range(3):
+            start = {**values, name: values[name] + np.eye(3)[axis]}
+            np.testing.assert_allclose(
+                spec.from_step(values, start) - before, spec.start_effect[k], atol=1e-12
+            )
+            k += 1
+    assert k == len(spec.start_effect)
+
+
 def test_live_objects_are_not_seen():
     episode = demonstration(5)
     moved = replace(

@@ -39,6 +39,7 @@ def card(**changes) -> Card:
         "lr": 1e-3,
         "weight_decay": 1e-4,
         "std_floor": 2e-3,
+        "start_jitter_m": 4e-3,
         "clipped_fraction": 0.0,
         "curve": ((100, 0.5),),
         "seconds": 1.5,

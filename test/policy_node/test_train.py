@@ -136,6 +136,30 @@ def test_standardisation_has_a_floor_and_leaves_the_one_hot_alone():
     assert std[eef] == obs[:, eef].std()
 
 
+def test_jitter_of_the_start_changes_training_but_not_the_normalisation():
+    with_noise, without = quick(whole(0, 1)), quick(whole(0, 1), start_jitter_m=0.0)
+    assert not np.array_equal(
+        arrays(with_noise)["layer0.weight"], arrays(without)["layer0.weight"]
+    )
+    np.testing.assert_array_equal(arrays(with_noise)["obs_std"], arrays(without)["obs_std"])
+    assert without.policy.card.start_jitter_m == 0.0
+
+
+def test_network_cannot_tell_starts_apart_that_are_closer_than_the_jitter():
+    # Two episodes at one place, told apart by 2 mm of plate, with opposite gripper commands.
+    first = demonstration(0)
+    fields = {
+        **first.fields,
+        "plate_position": first.fields["plate_position"] + 2e-3,
+        "gripper": -first.fields["gripper"],
+    }
+    pair = [(first, None), (replace(first, id="other", fields=fields), None)]
+    settings = {"seed": 0, "steps": 600, "hidden": (64, 64)}
+    # Blind to the difference, the best answer is 0, with a loss of 1 in one output of four.
+    assert train(pair, start_jitter_m=0.02, **settings).loss > 0.2
+    assert train(pair, start_jitter_m=0.0, **settings).loss < 0.02
+
+
 def test_task_is_learned():
     reported = []
     trained = train(
@@ -177,6 +201,7 @@ def test_loss_that_is_not_finite_is_refused_with_its_step():
         ({"lr": 0.0}, "lr"),
         ({"std_floor": 0.0}, "std_floor"),
         ({"weight_decay": -1.0}, "weight_decay"),
+        ({"start_jitter_m": -1.0}, "start_jitter_m"),
         ({"variant": "pixels"}, "pixels"),
         ({"action_scale": 0.0}, "action scale"),
         ({"seed": -1}, "seed"),

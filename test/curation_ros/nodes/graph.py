@@ -135,9 +135,7 @@ class Graph:
         """Listen until something was heard, at most that long."""
         self._executor.spin_once(timeout_sec=seconds)
 
-    def until(
-        self, condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S
-    ) -> Any:
+    def until(self, condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
         """Listen until a condition holds; returns what it returned."""
         deadline_s = time.monotonic() + timeout_s
         while not (found := condition()):
@@ -183,7 +181,7 @@ class Graph:
         )
 
     def decided(self, episode_id: str, revision: int = 1) -> Status:
-        """Wait until a decision on an episode has been published, with that revision or a later."""
+        """Wait for a published decision on an episode, of that revision or a later one."""
         return self.until(
             lambda: next(
                 (

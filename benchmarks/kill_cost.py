@@ -1,0 +1,89 @@
+"""What `kill -9` of the recorder in mid-episode costs, at 10 topics and 200 Hz."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import streams
+import yaml
+
+from curation_ros.bags.reader import open_bag
+from curation_ros.core.stream import NS_PER_S
+from curation_ros.core.topic_map import topic_map_from_json
+from curation_ros.dataset import Dataset
+from curation_ros.processes import Domain, Nodes
+from curation_ros.recording import recover_partials
+
+COMMAND = "python benchmarks/run.py kill_cost"
+N_KILLS = 8
+
+
+def one(folder: Path, after_s: float) -> float:
+    """Kill a recorder; returns the seconds of the worst topic that its recovered bag lacks."""
+    domain = Domain()
+    topics = folder / "topics.yaml"
+    topics.write_text(yaml.safe_dump(streams.topic_map()))
+    try:
+        with Nodes(domain, folder / "logs") as nodes:
+            nodes.start("recorder", {"dataset": folder / "data", "topic_map": topics})
+            program = Path(__file__).with_name("streams.py")
+            sender = subprocess.Popen(
+                [sys.executable, str(program), "--seconds", str(after_s + 1), "--no-end"],
+                env={**os.environ, **domain.environment},
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            assert sender.stdout is not None
+            begun = json.loads(sender.stdout.readline())
+            time.sleep(after_s)
+            nodes.signal("recorder", signal.SIGKILL)
+            killed_ns = time.time_ns()
+            sender.communicate()
+    finally:
+        domain.close()
+    dataset = Dataset(folder / "data")
+    notices = recover_partials(dataset)
+    assert [n.state for n in notices] == ["closed"], notices
+    topic_map = topic_map_from_json(streams.topic_map())
+    last: dict[str, int] = {}
+    for sample in open_bag(dataset.bag_path(begun["episode"])).samples(topic_map):
+        last[sample.topic] = max(last.get(sample.topic, 0), sample.stamp_ns)
+    # Stamps run with the wall clock, from the start of the episode.
+    return (killed_ns - min(last[topic] for topic in topic_map.topics)) / NS_PER_S
+
+
+def run(n_kills: int = N_KILLS) -> list[dict[str, Any]]:
+    """Measure; a row a figure."""
+    rng = random.Random(0)
+    lost_s = []
+    for _ in range(n_kills):
+        with tempfile.TemporaryDirectory() as temporary:
+            lost_s.append(one(Path(temporary), rng.uniform(2.0, 4.0)))
+
+    def row(name: str, value: float, target: float | None = None) -> dict[str, Any]:
+        return {
+            "name": f"kill -9 of the recorder, {name} of {n_kills}, lost",
+            "value": value,
+            "unit": "s",
+            "against": "",
+            "ratio": None,
+            "target": None if target is None else f"< {target:g} s",
+            "holds": None if target is None else value < target,
+            "command": COMMAND,
+        }
+
+    return [row("median", sorted(lost_s)[n_kills // 2]), row("worst", max(lost_s), 0.3)]
+
+
+if __name__ == "__main__":
+    for result in run():
+        print(json.dumps(result))

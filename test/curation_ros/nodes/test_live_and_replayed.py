@@ -1,0 +1,209 @@
+"""One stream, one builder: live, offline and replayed decisions are equal to the last bit."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import signal
+
+import numpy as np
+import pytest
+from graph import Graph, jsonl
+from robot import (
+    PERIOD_NS,
+    PLATE,
+    Robot,
+    Take,
+    changed,
+    conflicting,
+    disordered,
+    interleaved,
+    jumped_back,
+    libero_take,
+    repeated,
+    without,
+)
+
+from curation_ros.cli.main import main as curation
+from curation_ros.dataset import Dataset
+
+pytestmark = pytest.mark.ros
+
+#: Longer than any queue: KEEP_LAST 1000 on both sides.
+LONG_STEPS = 1250
+N_REFERENCES = 4
+
+
+def nan_at(take: Take, step: int) -> Take:
+    stamp = take.started.start_ns + 10_000_000 + step * PERIOD_NS
+
+    def spoil(message):
+        message.pose.position.z = float("nan")
+
+    return changed(take, lambda topic, ns: topic == "eef_pose" and ns == stamp, spoil)
+
+
+def unknown_phase(take: Take) -> Take:
+    def rename(message):
+        message.status[0].message = "DANCE"
+
+    middle = (take.started.start_ns + take.ended.end_ns) // 2
+    return changed(take, lambda topic, ns: topic == "phase" and ns > middle, rename)
+
+
+#: Name -> (take, findings that it must have).
+TAKES = {
+    "clean": (lambda: libero_take(1), set()),
+    "early_release": (lambda: libero_take(2, open_at=70), set()),
+    "repeated": (lambda: repeated(libero_take(3)), set()),
+    "interleaved": (lambda: interleaved(libero_take(4), np.random.default_rng(0)), set()),
+    "no_counts": (lambda: libero_take(5, counts=False), set()),
+    "dropped": (lambda: without(libero_take(6), "joint_states", 50, 52), {"incomplete"}),
+    "gap": (lambda: without(libero_take(7), "eef_pose", 50, 60), {"incomplete", "gap"}),
+    "missing_topic": (lambda: without(libero_take(8), PLATE), {"missing-topic"}),
+    "disordered": (lambda: disordered(libero_take(9), "eef_pose", 30), {"clock-back"}),
+    "jump_back": (
+        lambda: jumped_back(libero_take(10), 0.6, 10 * PERIOD_NS + 3),
+        {"clock-back"},
+    ),
+    "conflicting": (lambda: conflicting(libero_take(11), PLATE, 33), {"duplicate-stamp"}),
+    "not_finite": (lambda: nan_at(libero_take(12), 20), {"not-finite"}),
+    "unknown_phase": (lambda: unknown_phase(libero_take(13)), {"unknown-phase"}),
+}
+STALLS = ("stall_within", "stall_over_the_end", "overflow", "overflow_over_the_end")
+
+
+class Session:
+    """Everything that was recorded: dataset, takes by name, first revisions by name."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self.reference = graph.folder / "reference"
+        self.dataset = graph.folder / "dataset"
+        self.replayed = graph.folder / "replayed"
+        self.takes: dict[str, Take] = {}
+
+    def record_reference(self, robot: Robot) -> None:
+        self.graph.start("recorder", key="reference", dataset=self.reference)
+        self.graph.ready("reference")
+        robot.until_heard()
+        for seed in range(N_REFERENCES):
+            take = robot.play(libero_take(100 + seed, name=f"reference-{seed}"))
+            assert self.graph.recorded(take.id).message.startswith("closed ")
+        self.graph.stop("reference")
+
+    def record_takes(self, robot: Robot) -> None:
+        for name, (make, _) in TAKES.items():
+            self.takes[name] = robot.play(make())
+            self.graph.settled(self.dataset, self.takes[name].id)
+
+    def record_stalls(self, robot: Robot) -> None:
+        """Stop the curator in mid-episode, and let it go on within the episode or after it."""
+        for name in STALLS:
+            overflows = name.startswith("overflow")
+            take = self.takes[name] = libero_take(20, LONG_STEPS if overflows else 120)
+            first, most = take.until(0.05), take.until(0.95)
+            robot.tell(take.started)
+            robot.send(take.messages[:first])
+            self.graph.nodes.send("curator", signal.SIGSTOP)
+            try:
+                robot.send(take.messages[first:most])
+                if name.endswith("the_end"):
+                    robot.send(take.messages[most:])
+                    robot.tell(take.ended)
+                    self.graph.recorded(take.id)
+            finally:
+                self.graph.nodes.send("curator", signal.SIGCONT)
+            if not name.endswith("the_end"):
+                robot.send(take.messages[most:])
+                robot.tell(take.ended)
+            self.graph.settled(self.dataset, take.id)
+
+    def replay(self, graph: Graph) -> None:
+        graph.start("curator", dataset=self.replayed, reference=[self.reference])
+        graph.start("replay", bags=[self.dataset])
+        code, log = graph.expect_exit("replay")
+        assert code == 0, log
+        graph.stop("curator")
+
+    def live(self, name: str):
+        return Dataset(self.dataset).decisions(self.takes[name].id)
+
+
+@pytest.fixture(scope="module")
+def session(graph, other_graph):
+    session = Session(graph)
+    with Robot(graph) as robot:
+        session.record_reference(robot)
+        graph.start("recorder", dataset=session.dataset)
+        graph.start("curator", dataset=session.dataset, reference=[session.reference])
+        graph.ready("recorder", "curator")
+        robot.until_heard(2)
+        session.record_takes(robot)
+        session.record_stalls(robot)
+    graph.stop("curator", "recorder")
+    session.replay(other_graph)
+    return session
+
+
+@pytest.fixture(scope="module")
+def offline(session):
+    """`curation score --json --write`: rows by episode, and no new revision where it agrees."""
+    before = {name: len(session.live(name)) for name in session.takes}
+    out = io.StringIO()
+    reference = ["--reference", str(session.reference)]
+    with contextlib.redirect_stdout(out):
+        assert curation(["score", str(session.dataset), *reference, "--json", "--write"]) == 0
+    # It logs what differs in scores, findings, verdict, reason, span or state hash.
+    assert {name: len(session.live(name)) for name in session.takes} == before
+    return {row["episode"]: row for row in jsonl(out.getvalue())}
+
+
+@pytest.mark.parametrize("name", [*TAKES, *STALLS])
+def test_live_offline_and_replayed_decisions_are_equal(session, offline, name):
+    live = session.live(name)[-1].to_json()
+    row = offline[session.takes[name].id]
+    shared = ("name", "scores", "reason", "span", "findings")
+    assert {k: row[k] for k in shared} == {k: live[k] for k in shared}
+    assert row["decision"] == live["verdict"]
+    replayed = Dataset(session.replayed).decisions(live["episode"])[-1].to_json()
+    apart = ("evidence", "revision")  # who compared what with which bag
+    assert {k: v for k, v in replayed.items() if k not in apart} == {
+        k: v for k, v in live.items() if k not in apart
+    }
+
+
+@pytest.mark.parametrize("name", TAKES)
+def test_each_fault_has_its_finding(session, name):
+    found = {f.id for f in session.live(name)[-1].findings}
+    assert found == TAKES[name][1]
+
+
+def test_verdicts_follow_from_the_takes(session):
+    verdicts = {name: session.live(name)[-1].verdict for name in session.takes}
+    assert verdicts["clean"] == "keep"
+    assert verdicts["early_release"] == "discard"
+    assert verdicts["missing_topic"] == "review"
+    assert verdicts["jump_back"] == "review"
+    assert verdicts["stall_within"] == "keep"
+
+
+def test_stall_without_loss_needs_one_revision(session):
+    for name in ("clean", "repeated", "interleaved", "stall_within", "stall_over_the_end"):
+        assert [d.revision for d in session.live(name)] == [1, 1], name
+        assert session.live(name)[-1].evidence["bag"] == "equal"
+
+
+@pytest.mark.parametrize("name", ["overflow", "overflow_over_the_end"])
+def test_live_loss_is_mended_by_the_bag(session, name):
+    first, last = session.live(name)
+    assert "incomplete" in {f.id for f in first.findings}
+    assert (last.revision, last.evidence["bag"], last.findings) == (2, "differs", ())
+
+
+def test_decisions_were_quick(session):
+    """From the gate's closing to the published decision; the bound is for a crowded machine."""
+    reports = [s for s in session.graph.health if "latency_ms_p99" in s.values]
+    p50, p99 = (float(reports[-1].values[f"latency_ms_{p}"]) for p in ("p50", "p99"))
+    print(f"decision latency: p50 {p50:.0f} ms, p99 {p99:.0f} ms")
+    assert p99 < 1000.0
