@@ -24,5 +24,8 @@ def test_sample_bag_has_its_golden_scores(capsys: pytest.CaptureFixture[str]) ->
     }
     assert row["scores"].keys() == golden["scores"].keys()
     for scorer, score in golden["scores"].items():
-        assert row["scores"][scorer] == pytest.approx(score, rel=_RELATIVE_TOLERANCE), scorer
+        if score is None:
+            assert row["scores"][scorer] is None, scorer
+        else:
+            assert row["scores"][scorer] == pytest.approx(score, rel=_RELATIVE_TOLERANCE), scorer
     assert (row["decision"], row["reason"]) == ("review", "no reference")

@@ -213,8 +213,8 @@ class _Demo:
     def train(self, manifests: dict[str, Path]) -> dict[str, Path]:
         steps = self.args.train_steps
         self.say(
-            f"[bold]4. Training.[/] The same behaviour cloning on each: {steps} gradient steps; bowl "
-            f"and plate blurred by {1e3 * _START_JITTER_M:g} mm, so that a dozen is enough."
+            f"[bold]4. Training.[/] The same behaviour cloning on each: {steps} gradient steps; "
+            f"bowl and plate blurred by {1e3 * _START_JITTER_M:g} mm, so that a dozen is enough."
         )
         jobs: dict[str, subprocess.Popen[str]] = {}
         logs = {name: self.logs / f"train-{name}.log" for name in manifests}

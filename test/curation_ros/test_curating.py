@@ -205,17 +205,6 @@ def test_without_a_reference_everything_is_for_review(dataset: Dataset) -> None:
     assert decided.decision.scores["gripper_timing"] == 237 / 240
 
 
-def test_progress_counts_what_has_arrived(dataset: Dataset) -> None:
-    live = _curator(dataset)
-    assert live.progress() == ("", {})
-    live.event(started(_good()), 0.0)
-    for sample in _stream_of("good")[:10]:
-        live.sample(sample, 0.0)
-    running, counts = live.progress()
-    assert running == _good().id
-    assert sorted(counts.values()) == [1, 1, 1, 1, 2, 2, 2]
-
-
 def test_aborted_episode_is_for_review_and_ends_with_its_clock(dataset: Dataset) -> None:
     end = ended(_good(), event="aborted", end_ns=None, counts={}, reason="no command for 5 s")
     samples = _stream_of("good")[:700]
