@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,17 @@ from curation_ros.core.scoring import Curation
 from curation_ros.core.topic_map import TopicMap, read_topic_map
 
 _SOURCE = Path(__file__).resolve().parents[1]
+#: What YAML must hold for each keyword of Curation.
+_KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
+    "scorers": (list, "a list"),
+    "rule": (str, "a name"),
+    "rule_scorer": (str, "a name"),
+    "length": (str, "a name"),
+    "length_value": ((int, float, type(None)), "a number"),
+    "scorer_params": (dict, "a mapping"),
+    "rule_params": (dict, "a mapping"),
+}
+_DEFAULTS = inspect.signature(Curation).parameters
 
 
 def share_file(relative: str) -> Path:
@@ -46,28 +58,50 @@ def read_curation(config: Path | None, overrides: Mapping[str, Any]) -> Curation
 
     Args:
         config: `config/curation.yaml` or one like it; None takes the defaults.
-        overrides: keywords of Curation that win over the file; empty values do not.
+        overrides: keywords of Curation that win over the file; empty values do not. The scorer
+            that decides is added to `scorers` that lack it.
 
     Raises:
         ConfigError: naming file and key.
     """
-    settings: dict[str, Any] = {}
-    if config is not None:
-        try:
-            raw = yaml.safe_load(config.read_text())
-        except OSError as err:
-            raise ConfigError(f"curation config {config}: {err.strerror}") from err
-        except (yaml.YAMLError, UnicodeDecodeError) as err:
-            reason = str(err).splitlines()[0]
-            raise ConfigError(f"curation config {config} is not YAML: {reason}") from err
-        if not isinstance(raw, dict):
-            raise ConfigError(f"curation config {config}: expected a mapping, found {raw!r:.60}")
-        settings.update(raw)
-    settings.update({k: v for k, v in overrides.items() if v})
+    where = f"curation config {config}"
+    settings = {} if config is None else _read_settings(config, where)
+    given = {k: v for k, v in overrides.items() if v}
+    settings.update(given)
+    if "scorers" in given:
+        names = list(given["scorers"])
+        if settings.get("rule") == "none":
+            settings["rule_scorer"] = names[0]  # nothing decides
+        decides = settings.get("rule_scorer", _DEFAULTS["rule_scorer"].default)
+        settings["scorers"] = [*names, *(n for n in [decides] if n not in names)]
     try:
         return Curation(**settings)
-    except TypeError as err:
-        raise ConfigError(f"curation config {config}: {err}") from err
+    except ConfigError as err:
+        raise ConfigError(f"{where}: {err}" if config and not given else str(err)) from err
+
+
+def _read_settings(config: Path, where: str) -> dict[str, Any]:
+    try:
+        raw = yaml.safe_load(config.read_text())
+    except OSError as err:
+        raise ConfigError(f"{where}: {err.strerror}") from err
+    except (yaml.YAMLError, ValueError) as err:  # an impossible date is a ValueError
+        raise ConfigError(f"{where} is not YAML: {str(err).splitlines()[0]}") from err
+    if not isinstance(raw, dict):
+        raise ConfigError(f"{where}: expected a mapping, found {raw!r:.60}")
+    for key, value in raw.items():
+        if key not in _DEFAULTS:
+            raise ConfigError(f"{where}: unknown key {key!r}; known are {', '.join(_DEFAULTS)}")
+        kind, text = _KINDS[key]
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise ConfigError(f"{where}: {key!r} is {value!r:.60}, expected {text}")
+    for key in ("scorers", "scorer_params"):
+        if not all(isinstance(name, str) for name in raw.get(key, ())):
+            raise ConfigError(f"{where}: {key!r} is {raw[key]!r:.60}, expected names of scorers")
+    for name, params in raw.get("scorer_params", {}).items():
+        if not isinstance(params, dict) or not all(isinstance(key, str) for key in params):
+            raise ConfigError(f"{where}: parameters of {name!r} are {params!r:.60}: no mapping")
+    return raw
 
 
 def read_reference(paths: Sequence[Path], topic_map: TopicMap | None) -> list[Episode]:

@@ -16,6 +16,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,10 @@ PRAGMA user_version = 1;
 _SCHEMA_VERSION = 1
 _TABLES = ("episodes", "decisions", "scores", "selections")
 _BUSY_TIMEOUT_S = 10.0
+
+
+#: File systems on which processes cannot share the memory that SQLite's WAL needs.
+_SHARED = {"9p", "beegfs", "ceph", "cifs", "fuse.sshfs", "gpfs", "lustre", "nfs", "nfs4", "smb3"}
 
 
 class _SpoiltIndexError(CurationError):
@@ -85,6 +90,21 @@ def _named_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as err:
         raise CurationError(f"{err.filename or path}: {err.strerror or err}") from err
+
+
+def _file_system(path: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
+    """Kind of the file system that a path without links is on; empty where that is unknown."""
+    found, depth = "", 0
+    try:
+        lines = mounts.read_text(errors="surrogateescape").splitlines()
+    except OSError:  # not Linux
+        return ""
+    for line in lines:
+        _, point, kind, *_ = line.split(" ")
+        at = Path(point.replace("\\040", " "))
+        if len(at.parts) >= depth and path.is_relative_to(at):  # of one place, the last mount
+            found, depth = kind, len(at.parts)
+    return found
 
 
 def _append_line(path: Path, record: Mapping[str, Any]) -> None:
@@ -207,9 +227,13 @@ class Dataset:
         except EpisodeError as err:
             raise EpisodeError(f"{log}: {err}") from err
 
-    def latest_decisions(self) -> dict[str, Decision]:
-        """The decision in force of every decided episode, by id."""
-        logs = sorted((self.path / "decisions").glob("*.jsonl"))
+    def latest_decisions(self, last: int | None = None) -> dict[str, Decision]:
+        """The decision in force of every decided episode, by id and in the order of ids.
+
+        Args:
+            last: of so many episodes, those with the highest (youngest) ids; None: of all.
+        """
+        logs = sorted((self.path / "decisions").glob("*.jsonl"))[-(last or 0) :]
         return in_force(d for log in logs for d in self.decisions(log.stem))
 
     def start_of(self) -> dict[str, tuple[str, int]]:
@@ -281,10 +305,18 @@ class Dataset:
 
     # --- index ------------------------------------------------------------------------------
 
+    @cached_property
+    def index_elsewhere(self) -> str:
+        """Why the index is not in the dataset but in the user's cache; empty if it is there."""
+        kind = _file_system(self.path.resolve())
+        if kind in _SHARED:
+            return f"the dataset is on a network file system ({kind})"
+        return "" if os.access(self.path, os.W_OK) else "the dataset cannot be written"
+
     @property
     def index_path(self) -> Path:
-        """Where the index lives: in the dataset, or in the user's cache if that is read-only."""
-        if os.access(self.path, os.W_OK):
+        """Where the index lives."""
+        if not self.index_elsewhere:
             return self.path / "index.sqlite"
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         key = hashlib.sha256(str(self.path.resolve()).encode()).hexdigest()[:16]

@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import IO, Any
 
 from curation_ros.core.errors import CurationError
@@ -31,6 +31,8 @@ NODE_MODULES = {
 _DOMAINS = range(1, 102)
 _PATIENCE_S = 10.0
 _PR_SET_PDEATHSIG = 1
+# Looked up once: between fork and exec a child of several threads must do next to nothing.
+_PRCTL = getattr(ctypes.CDLL(None), "prctl", None)
 
 
 class Domain:
@@ -83,8 +85,8 @@ def _is_in_use(domain_id: int) -> bool:
 
 def _die_with_parent() -> None:
     # Linux only; elsewhere children outlive a parent that was killed.
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if _PRCTL is not None:
+        _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 class Nodes:
@@ -135,11 +137,8 @@ class Nodes:
             remaps: ROS names and what they become; `__ns` is the namespace.
         """
         key = key or node
-        arguments = [sys.executable, "-m", NODE_MODULES[node], "--ros-args"]
-        for name, value in parameters.items():
-            arguments += ["-p", f"{name}:={_yaml(value)}"]
-        for name, value in (remaps or {}).items():
-            arguments += ["-r", f"{name}:={value}"]
+        arguments = [sys.executable, "-m", NODE_MODULES[node]]
+        arguments += node_arguments(parameters, remaps or {})
         log = (self._logs / f"{key}.log").open("ab")
         process = subprocess.Popen(
             arguments,
@@ -203,10 +202,24 @@ class Nodes:
         log.close()
 
 
+def node_arguments(
+    parameters: Mapping[str, Any], remaps: Mapping[str, str] = MappingProxyType({})
+) -> list[str]:
+    """Parameters and remaps of a node, as its command line has them."""
+    arguments = ["--ros-args"]
+    for name, value in parameters.items():
+        arguments += ["-p", f"{name}:={_yaml(value)}"]
+    for name, value in remaps.items():
+        arguments += ["-r", f"{name}:={value}"]
+    return arguments
+
+
 def _yaml(value: Any) -> str:
     """A parameter value as ROS arguments spell it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, Sequence) and not isinstance(value, str):
         return "[" + ", ".join(_yaml(v) for v in value) + "]"
-    return f"'{value}'" if isinstance(value, (str, Path)) else repr(value)
+    if isinstance(value, (str, Path)):
+        return "'" + str(value).replace("'", "''") + "'"
+    return repr(value)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from curation_ros.cli.output import console, percent, print_json
+from curation_ros.cli.output import percent, print_json, say
 from curation_ros.evaluating import evaluate_on_graph, summary
 
 
@@ -37,13 +37,13 @@ def run(args: argparse.Namespace) -> int:
             print_json(row)
         else:
             outcome = "success" if row["success"] else f"failed in {row['stage']}"
-            console.print(f"{row['start']}: {outcome} after {row['steps']} steps", markup=False)
+            say(f"{row['start']}: {outcome} after {row['steps']} steps")
     total = summary(policy.id, rows)
     if args.json:
         print_json(total)
     else:
         interval = (total["ci95"][0], total["ci95"][1])
-        console.print(f"success {percent(total['successes'], total['rollouts'], interval)}")
+        say(f"success {percent(total['successes'], total['rollouts'], interval)}")
     return 0
 
 

@@ -24,6 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Refresh or rebuild, then list the episodes with the decisions in force."""
     dataset = Dataset(args.dataset)
+    if dataset.index_elsewhere:
+        warn(f"{dataset.index_elsewhere}: its index is {dataset.index_path}")
     for problem in dataset.rebuild() if args.rebuild else dataset.refresh():
         warn(problem)
     decided = dataset.latest_decisions()
@@ -52,7 +54,8 @@ def run(args: argparse.Namespace) -> int:
             )
         else:
             shown = Text(verdict or "undecided", VERDICT_STYLE.get(verdict or "", "dim"))
-            table.add_row(row["name"], shown, by or "", f"{seconds:.1f}", Text(reason))
+            name = Text(row["name"] or row["id"][:8])
+            table.add_row(name, shown, Text(by or ""), f"{seconds:.1f}", Text(reason))
     if not args.json:
         console.print(table)
     return 0

@@ -20,9 +20,14 @@ def print_json(row: Mapping[str, Any]) -> None:
     print(json.dumps(row, allow_nan=False), flush=True)
 
 
+def say(text: str) -> None:
+    """A line as it is: a path that was broken into two would be of no use."""
+    console.print(text, markup=False, soft_wrap=True)
+
+
 def warn(problem: object) -> None:
     """A line about something that did not stop us."""
-    progress_console.print(f"warning: {problem}", style="yellow", markup=False)
+    progress_console.print(f"warning: {problem}", style="yellow", markup=False, soft_wrap=True)
 
 
 def percent(successes: int, n: int, interval: tuple[float, float]) -> str:

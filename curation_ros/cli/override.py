@@ -6,7 +6,7 @@ import argparse
 import getpass
 from pathlib import Path
 
-from curation_ros.cli.output import console, print_json
+from curation_ros.cli.output import print_json, say
 from curation_ros.curating import OVERRIDES, override
 from curation_ros.dataset import Dataset
 
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
         print_json(decision.to_json())
     else:
         text = f"{decision.verdict} {decision.name} (revision {decision.revision})"
-        console.print(f"{text}: {decision.reason}", markup=False)
+        say(f"{text}: {decision.reason}")
     return 0
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from curation_ros.cli.output import console, print_json
+from curation_ros.cli.output import print_json, say
 from curation_ros.core.errors import CurationError
 
 _PATIENCE_S = 5.0
@@ -28,5 +28,5 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(json.loads(message) if message.startswith("{") else {"message": message})
     else:
-        console.print(message, markup=False)
+        say(message)
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PATH",
         help="datasets or bags of trusted demonstrations",
     )
-    parser.add_argument("--scorers", help=f"comma separated, of: {', '.join(SCORERS)}")
+    parser.add_argument(
+        "--scorers",
+        help=f"comma separated, beside the one that decides: {', '.join(SCORERS)}",
+    )
     parser.add_argument("--rule", help="decision rule, where not that of the config")
     parser.add_argument(
         "--config", type=Path, help="scorers and rule; default config/curation.yaml"
@@ -60,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Score everything that can be read; say what could not."""
     config = args.config or share_file("config/curation.yaml")
-    names = args.scorers.split(",") if args.scorers else None
+    names = [n.strip() for n in args.scorers.split(",")] if args.scorers else None
     curation = read_curation(config, {"scorers": names, "rule": args.rule})
     topic_map = read_topic_map(args.topic_map) if args.topic_map else None
     dataset = _dataset(args) if args.write else None
@@ -76,7 +80,12 @@ def run(args: argparse.Namespace) -> int:
             continue
         episode, decision = result
         if dataset is not None:
-            decision = log_decision(dataset, decision)
+            # A person's decision stays in force, beside the scores and findings of now.
+            decision = replace(
+                log_decision(dataset, decision),
+                scores=decision.scores,
+                findings=decision.findings,
+            )
         flawed = flawed or bool(decision.findings)
         row = decision_row(path, episode, decision)
         rows.append(row)
@@ -147,7 +156,7 @@ def _table(rows: list[dict[str, Any]], curation: Curation) -> Table:
     for row in rows:
         scores = [row["scores"][s] for s in scorers]
         table.add_row(
-            row["name"] or row["episode"][:8],
+            Text(row["name"] or row["episode"][:8]),
             Text(row["decision"], VERDICT_STYLE[row["decision"]]),
             str(row["length"]),
             *("-" if v is None else f"{v:.3g}" for v in scores),

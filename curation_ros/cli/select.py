@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from curation_ros.cli.output import console, print_json
+from curation_ros.cli.output import print_json, say
 from curation_ros.core.selection import KEEP_RULES
 from curation_ros.dataset import Dataset
 from curation_ros.selecting import save_selection
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({"manifest": str(path), "kept": kept, "of": manifest.kept_of})
     else:
-        console.print(f"kept {kept} of {manifest.kept_of}: {path}", markup=False)
+        say(f"kept {kept} of {manifest.kept_of}: {path}")
         if manifest.abstained:
-            console.print(f"{len(manifest.abstained)} could not be judged and are not kept")
+            say(f"{len(manifest.abstained)} could not be judged")
     return 0

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from curation_ros.cli.output import console, print_json, progress_console
+from curation_ros.cli.output import print_json, progress_console, say
 from curation_ros.core.errors import ConfigError
 from curation_ros.selecting import read_manifest, read_selected
 
@@ -36,14 +36,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train and save."""
-    from policy_node.train import train
-
     manifest, dataset = read_manifest(args.selection)
     if not manifest.entries:
         raise ConfigError(f"selection {args.selection}: it keeps no episode: nothing to train on")
     episodes = read_selected(manifest, dataset)
     digest = hashlib.sha256(args.selection.read_bytes()).hexdigest()
-    report = args.report.open("w", buffering=1) if args.report else None
+    # Only now: torch takes seconds to load, and what is wrong with a selection needs none of it.
+    from policy_node.train import train
+
+    try:
+        report = args.report.open("w", buffering=1) if args.report else None
+    except OSError as err:
+        raise ConfigError(f"report {args.report}: {err.strerror}") from err
     with Progress(console=progress_console, transient=True, disable=args.json) as bar:
         task = bar.add_task(f"training on {len(episodes)} episodes", total=args.steps)
 
@@ -72,9 +76,8 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(row)
     else:
-        console.print(
+        say(
             f"policy {folder}: loss {trained.loss:.4f} after {policy.card.steps} steps "
-            f"on {len(episodes)} episodes, {trained.seconds:.1f} s",
-            markup=False,
+            f"on {len(episodes)} episodes, {trained.seconds:.1f} s"
         )
     return 0

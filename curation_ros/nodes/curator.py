@@ -26,7 +26,7 @@ from curation_ros.core.stream import Sample
 from curation_ros.curating import Decided, LiveCuration
 from curation_ros.dataset import Dataset
 from curation_ros.nodes.health import Health
-from curation_ros.nodes.messages import array_to_ros, single_from_ros, status_to_ros
+from curation_ros.nodes.messages import single_from_ros, status_to_ros
 from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import DECISIONS, DRAIN_S, EVENTS, LATCHED
 from curation_ros.nodes.spinning import run
@@ -60,7 +60,8 @@ class Curator(Node):
         self._live = LiveCuration(
             dataset, topic_map, CdrDecoder(), curation, drain_timeout_s=p["drain_timeout_s"]
         )
-        self._recent: deque[DiagnosticStatus] = deque(maxlen=_KEPT)
+        known = dataset.latest_decisions(_KEPT).values()
+        self._recent: deque[DiagnosticStatus] = deque(map(_to_ros, known), _KEPT)
         self._latencies_ms: deque[float] = deque(maxlen=_KEPT)
         self._decided = self.create_publisher(DiagnosticArray, "curator/decision", DECISIONS)
         # Before the data subscriptions: see the recorder.
@@ -161,7 +162,16 @@ class Curator(Node):
                 self._latencies_ms.append(1e3 * (one.latency_s + time.perf_counter() - began))
 
     def _publish(self, d: Decision) -> None:
-        status = decision_to_status(
+        message = DiagnosticArray(status=[_to_ros(d)])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._recent += message.status
+        self._decided.publish(message)
+        self.get_logger().info(f"{d.verdict} {d.name} (revision {d.revision}): {d.reason}")
+
+
+def _to_ros(d: Decision) -> DiagnosticStatus:
+    return status_to_ros(
+        decision_to_status(
             episode_id=d.episode,
             name=d.name,
             verdict=d.verdict,
@@ -170,9 +180,7 @@ class Curator(Node):
             revision=d.revision,
             scores=d.scores,
         )
-        self._recent.append(status_to_ros(status))
-        self._decided.publish(array_to_ros([status], self.get_clock().now().nanoseconds))
-        self.get_logger().info(f"{d.verdict} {d.name} (revision {d.revision}): {d.reason}")
+    )
 
 
 def main() -> int:

@@ -171,7 +171,9 @@ class Recorder(Node):
         elif self._override.get_subscription_count() == 0:
             response.message = "no curator listens: use curation override"
         else:
-            self._override.publish(KeyValue(key=self._last_id, value=f"{verdict} by the recorder"))
+            self._override.publish(
+                KeyValue(key=self._last_id, value=f"{verdict} with the recorder's button")
+            )
             if not self._auto:
                 self._dataset.append_truth({"episode": self._last_id, "button": verdict})
             response.success, response.message = True, f"{verdict} {self._last_id}"

@@ -51,9 +51,11 @@ def run(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, stop)
-    rclpy.init(
-        args=None if args is None else list(args), signal_handler_options=SignalHandlerOptions.NO
-    )
+    given = None if args is None else list(args)
+    try:
+        rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as err:  # rclpy raises its own classes of it
+        return _complain(f"ROS arguments: {str(err).partition(', at /')[0]}")
     node = None
     try:
         node = make()
@@ -70,11 +72,15 @@ def run(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     except Finished:
         pass
     except CurationError as err:
-        print(f"error: {err}", file=sys.stderr)  # noqa: T201  the node may not exist yet
-        return 2
+        return _complain(err)
     finally:
         if node is not None:
             node.close()  # type: ignore[attr-defined]
             node.destroy_node()
         rclpy.try_shutdown()  # type: ignore[attr-defined]
     return 0
+
+
+def _complain(problem: object) -> int:
+    print(f"error: {problem}", file=sys.stderr)  # noqa: T201  there may be no node to log with
+    return 2

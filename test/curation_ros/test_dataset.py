@@ -19,7 +19,7 @@ from curation_ros.core.decisions import Decision
 from curation_ros.core.errors import CurationError, EpisodeError
 from curation_ros.core.identity import new_episode_id
 from curation_ros.core.selection import Entry, Manifest
-from curation_ros.dataset import Dataset, write_atomically
+from curation_ros.dataset import Dataset, _file_system, write_atomically
 
 TABLES = ("episodes", "decisions", "scores", "selections")
 ID = "0197aaaa-0000-7000-8000-000000000001"
@@ -443,7 +443,40 @@ def test_slow_reader_of_the_index_holds_up_no_decision(dataset: Dataset) -> None
     assert row["n"] == 1
 
 
-# --- where nothing can be written ---------------------------------------------------------------
+# --- where the index cannot be in the dataset ---------------------------------------------------
+
+_MOUNTS = r"""
+/dev/vda / ext4 rw 0 0
+server:/home /home nfs4 rw 0 0
+/dev/vdb /home/me/local ext4 rw 0 0
+me@server: /home/me/with\040space fuse.sshfs rw 0 0
+overlay /data overlay rw 0 0
+//server/share /data cifs rw 0 0
+"""
+
+
+@pytest.mark.parametrize(
+    ("path", "kind"),
+    [
+        ("/", "ext4"),
+        ("/home", "nfs4"),
+        ("/home/me/data", "nfs4"),
+        ("/homework", "ext4"),
+        ("/home/me/local/data", "ext4"),
+        ("/home/me/with space/data", "fuse.sshfs"),
+        ("/data/x", "cifs"),
+    ],
+)
+def test_file_system_is_that_of_the_nearest_mount(tmp_path: Path, path: str, kind: str) -> None:
+    (tmp_path / "mounts").write_text(_MOUNTS.strip() + "\n")
+    assert _file_system(Path(path), tmp_path / "mounts") == kind
+    assert _file_system(Path(path), tmp_path / "none") == ""
+
+
+def test_index_of_a_local_dataset_is_in_it(dataset: Dataset) -> None:
+    assert dataset.index_elsewhere == ""
+    assert dataset.index_path == dataset.path / "index.sqlite"
+
 
 _ON_READ_ONLY_DISK = """
 import sys
@@ -452,6 +485,7 @@ from curation_ros.core.errors import CurationError
 from curation_ros.dataset import Dataset
 dataset = Dataset(sys.argv[1])
 print(dataset.index_path)
+print(dataset.index_elsewhere)
 print(len(dataset.names()), dataset.rebuild())
 decision = Decision(episode="x", name="n", verdict="keep", reason="r", span=(0, 1))
 for write in (lambda: dataset.append_decision(decision), lambda: dataset.append_truth({})):
@@ -485,7 +519,8 @@ def test_index_of_a_read_only_dataset_is_in_the_cache(
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    index, counted, *refused = done.stdout.splitlines()
+    index, why, counted, *refused = done.stdout.splitlines()
+    assert why == "the dataset cannot be written"
     assert Path(index).parent == tmp_path / "cache" / "curation_ros"
     assert Path(index).is_file()
     assert counted == "1 []"

@@ -123,7 +123,7 @@ def _random_scalar(detail: Any, rng: np.random.Generator) -> Any:
     if name.startswith("float"):
         return float(np.dtype(name).type(rng.normal()))
     info = np.iinfo("uint8" if name == "char" else name)
-    return int(rng.integers(info.min, info.max, dtype=info.dtype, endpoint=True))
+    return int(rng.integers(info.min, info.max, dtype=info.dtype.type, endpoint=True))
 
 
 def to_plain(value: Any) -> Any:

@@ -22,11 +22,25 @@ try:
     import rclpy.context
     from diagnostic_msgs.msg import DiagnosticArray, KeyValue
     from rclpy.executors import SingleThreadedExecutor
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
 
     from curation_ros.nodes.messages import single_from_ros, status_from_ros
-    from curation_ros.nodes.qos import DECISIONS, EVENTS, LATCHED
+    from curation_ros.nodes.qos import DECISIONS, EVENTS, LATCHED, MAPPED
 except ImportError as err:
     pytest.skip(f"rclpy is not installed: {err}", allow_module_level=True)
+
+#: For tests: they import from here what needs ROS, so that they are skipped without it.
+__all__ = [
+    "DECISIONS",
+    "MAPPED",
+    "PATIENCE_S",
+    "DiagnosticArray",
+    "Graph",
+    "KeyValue",
+    "QoSProfile",
+    "ReliabilityPolicy",
+    "jsonl",
+]
 
 #: Patience for anything that takes part of a second on an idle machine.
 PATIENCE_S = 60.0
@@ -60,7 +74,7 @@ class Graph:
         self.nodes = Nodes(self.domain, self.folder / "logs")
         self.context = rclpy.context.Context()
         rclpy.init(context=self.context, domain_id=self.domain.id)
-        self.node = rclpy.create_node("probe", context=self.context)
+        self.node = rclpy.create_node("probe", context=self.context, enable_rosout=False)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
         self.node.create_subscription(
@@ -202,6 +216,17 @@ class Graph:
             return known[-1] if known and "bag" in known[-1].evidence else None
 
         return self.until(compared, f"decision on {episode_id} compared with its bag")
+
+    def call(self, kind: Any, service: str, request: Any) -> Any:
+        """Call a service; returns its response."""
+        client = self.node.create_client(kind, service)
+        try:
+            self.until(client.service_is_ready, f"service {service}")
+            future = client.call_async(request)
+            self.until(future.done, f"answer of {service}")
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
 
     def problem(self, node: str, text: str) -> Status:
         """Wait for a complaint of a node on /diagnostics."""

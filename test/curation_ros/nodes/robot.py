@@ -89,7 +89,8 @@ def plain(value: Any) -> Any:
     if hasattr(value, "get_fields_and_field_types"):
         names = list(value.get_fields_and_field_types())
     elif hasattr(value, "__dataclass_fields__"):
-        names = [n for n in value.__dataclass_fields__ if n != "__msgtype__"]
+        # Without its type's constants, which are in capitals.
+        names = [n for n in value.__dataclass_fields__ if n != "__msgtype__" and not n.isupper()]
     elif hasattr(value, "__slots__") and not isinstance(value, (bytes, str, np.generic)):
         names = [n for n in value.__slots__ if not n.startswith("_")]
     elif isinstance(value, bytes):
@@ -115,9 +116,14 @@ def new_start_ns(length_s: float = 60.0) -> int:
 
 
 def make_take(
-    messages: Sequence[Sent], start_ns: int, name: str = "", *, counts: bool = True
+    messages: Sequence[Sent],
+    start_ns: int,
+    name: str = "",
+    *,
+    end_ns: int | None = None,
+    counts: bool = True,
 ) -> Take:
-    """A take of these messages; its owner counts them, as it ought to."""
+    """A take of these messages; its owner counts them, or it ends and they go on."""
     number = next(_numbers)
     stamps: dict[str, set[int]] = {}
     for topic, message in messages:
@@ -126,7 +132,7 @@ def make_take(
     ended = replace(
         started,
         event="ended",
-        end_ns=max(max(s) for s in stamps.values()),
+        end_ns=end_ns or max(max(s) for s in stamps.values()),
         counts={t: len(s) for t, s in stamps.items()} if counts else {},
     )
     return Take(started, ended, tuple(messages))
@@ -173,6 +179,40 @@ def libero_messages(episode: Episode) -> list[Sent]:
             ("command/gripper", joints_to_ros(["gripper"], f["gripper"][k], [0.0], [0.0], ns)),
         ]
     return out
+
+
+def other_robot_messages(
+    rng: np.random.Generator, start_ns: int, arm: Sequence[str], *, open_at: int | None = None
+) -> list[Sent]:
+    """A robot of test_any_robot: joints in an order of this episode's own, a continuous jaw.
+
+    Its topics run at rates and phases of their own, so that nothing but the map joins them. It
+    goes on for three steps after the last that belongs to the episode.
+    """
+    order = list(rng.permutation([*arm, "jaw"]))
+    out: list[tuple[int, Sent]] = []
+    width = 0.08
+    for k in range(N_STEPS + 3):
+        ns = start_ns + 1_000_000 + k * PERIOD_NS
+        is_open = k < CLOSE_AT or (open_at is not None and k >= open_at)
+        wanted = 0.08 if is_open else 0.0
+        motion = 0.2 * np.sin(0.05 * k + np.arange(6)) + 0.01 * rng.standard_normal(6)
+        pose = pose_to_ros(0.1 * motion[:3] + [0.4, 0.0, 0.3], (0.0, 0.0, 0.0, 1.0), ns)
+        twist = twist_to_ros(motion[:3], ns + 4_000_000)
+        twist.twist.angular = Vector3(x=motion[3], y=motion[4], z=motion[5])
+        for sub in (0, PERIOD_NS // 2):  # the joints come twice as often as the tool
+            position = dict(zip(arm, motion, strict=False)) | {"jaw": width}
+            joints = joints_to_ros(order, [position[j] for j in order], [0.0] * 4, [0.0] * 4, ns)
+            _restamp(joints, ns - 500_000 + sub)
+            out.append((ns - 500_000 + sub, ("driver/joint_states", joints)))
+        hand = joints_to_ros(["jaw"], [wanted], [0.0], [0.0], ns + 5_000_000)
+        out += [
+            (ns, ("tool/pose", pose)),
+            (ns + 4_000_000, ("servo/command", twist)),
+            (ns + 5_000_000, ("hand/command", hand)),
+        ]
+        width = wanted  # by the next step
+    return [sent for _, sent in sorted(out, key=lambda o: o[0])]
 
 
 # --- faults ---------------------------------------------------------------------------------
@@ -282,7 +322,9 @@ class Robot:
         import rclpy
 
         self._graph = graph
-        self.node = rclpy.create_node(name, context=graph.context, namespace=namespace)
+        self.node = rclpy.create_node(
+            name, context=graph.context, namespace=namespace, enable_rosout=False
+        )
         types = (map_ or topic_map()).topics if types is None else types
         self.publishers = {
             topic: self.node.create_publisher(
@@ -345,7 +387,3 @@ class Robot:
 def distinct(messages: Iterable[Sent]) -> dict[str, int]:
     """Distinct stamps by topic."""
     return dict(Counter(topic for topic, _ in {(t, stamp_ns(m)) for t, m in messages}))
-
-
-def vector(x: float, y: float, z: float) -> Vector3:
-    return Vector3(x=x, y=y, z=z)

@@ -1,0 +1,174 @@
+"""A recorder that follows `episode`: whole bags, whatever happens to it or to its topics."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+from mcap_ros2.reader import read_ros2_messages
+from robot import Robot, distinct, libero_take, plain, stamp_ns
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from curation_ros.bags.reader import open_bag, read_episode
+from curation_ros.dataset import Dataset
+
+pytestmark = pytest.mark.ros
+
+RATE_HZ = 60.0
+SIGNALS = {"int": signal.SIGINT, "term": signal.SIGTERM, "hup": signal.SIGHUP}
+KILLED = dict.fromkeys(("killed-0", "killed-1", "killed-2"), signal.SIGKILL)
+TOGETHER = ("first", "second")
+#: The contract: a kill costs less than this of the episode.
+MOST_LOST_S = 0.3
+
+
+class Sessions:
+    """Nine recorders on one graph, and one episode that goes differently for each."""
+
+    def __init__(self, graph):
+        self.graph = graph
+        self.sent = {}
+        self.codes = {}
+
+    def dataset(self, key):
+        return self.graph.folder / ("together" if key in TOGETHER else key)
+
+    def bag(self, key):
+        return self.dataset(key) / "episodes" / self.take.id
+
+    def record(self, robot):
+        keys = (*TOGETHER, *SIGNALS, *KILLED)
+        for key in keys:
+            self.graph.start("recorder", key, dataset=self.dataset(key))
+        robot.until_heard(len(keys))
+        self.take = libero_take(1, 240)
+        messages = self.take.messages
+        robot.tell(self.take.started)
+        done = 0
+        # At a tenth, two tenths ... of the episode; the kills a little apart from each other, so
+        # that they fall differently between two flushes.
+        for k, (key, number) in enumerate({**KILLED, **SIGNALS}.items(), 1):
+            upto = self.sent[key] = len(messages) * k // 10 + 13 * k
+            robot.send(messages[done:upto], rate_hz=RATE_HZ)
+            done = upto
+            if key in SIGNALS:
+                self.graph.quiet(0.3)  # it has taken everything
+            self.graph.nodes.send(key, number)
+            if key in SIGNALS:
+                self.codes[key], _ = self.graph.expect_exit(key)
+        robot.send(messages[done:], rate_hz=RATE_HZ)
+        robot.tell(self.take.ended)
+        for key in KILLED:
+            self.codes[key], _ = self.graph.expect_exit(key)
+        self.graph.until(self.bag("first").exists, "the whole bag")
+
+
+@pytest.fixture(scope="module")
+def robot(graph):
+    with Robot(graph) as robot:
+        yield robot
+
+
+@pytest.fixture(scope="module")
+def sessions(graph, robot):
+    sessions = Sessions(graph)
+    sessions.record(robot)
+    return sessions
+
+
+def test_two_recorders_on_one_dataset_make_one_bag(graph, sessions):
+    said = {key: graph.log(key) for key in TOGETHER}
+    idle = [key for key in TOGETHER if "another recorder has this episode" in said[key]]
+    assert len(idle) == 1
+    assert [key for key in TOGETHER if f"closed {sessions.take.name}" in said[key]] == [
+        key for key in TOGETHER if key not in idle
+    ]
+    assert all(graph.nodes.ended(key) is None for key in TOGETHER)
+    assert list(Dataset(sessions.dataset("first")).bags()) == [sessions.bag("first")]
+    assert read_episode(sessions.bag("first")).findings == ()
+
+
+def test_bag_has_what_was_sent_for_rosbags(sessions):
+    sent = iter_sent(sessions.take)
+    with AnyReader(
+        [sessions.bag("first")], default_typestore=get_typestore(Stores.ROS2_JAZZY)
+    ) as reader:
+        for connection, _, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            assert plain(message) == next(sent[connection.topic])
+    assert not any(list(rest) for rest in sent.values())
+
+
+def test_bag_has_what_was_sent_for_mcap(sessions):
+    sent = iter_sent(sessions.take)
+    path = next(sessions.bag("first").glob("*.mcap"))
+    for read in read_ros2_messages(path):
+        assert plain(read.ros_msg) == next(sent[read.channel.topic])
+        assert read.sequence_count > 0
+        assert read.publish_time_ns <= read.log_time_ns
+    assert not any(list(rest) for rest in sent.values())
+
+
+def bag_counts(bag):
+    return {name.lstrip("/"): topic.count for name, topic in bag.topics.items()}
+
+
+def iter_sent(take):
+    return {
+        f"/{topic}": iter([plain(m) for m in take.of(topic)]) for topic in distinct(take.messages)
+    }
+
+
+@pytest.mark.parametrize("key", SIGNALS)
+def test_signal_in_mid_episode_leaves_a_whole_bag(sessions, key):
+    assert sessions.codes[key] == 0
+    bag = open_bag(sessions.bag(key))
+    assert (bag.path / "metadata.yaml").exists()
+    event = bag.event()
+    assert (event.event, event.reason) == ("aborted", "aborted: the recorder was stopped")
+    assert bag_counts(bag) == distinct(sessions.take.messages[: sessions.sent[key]])
+    assert {f.id for f in read_episode(bag.path).findings} == {"aborted"}
+
+
+def test_kill_costs_a_fraction_of_a_second(graph, robot, sessions):
+    """Each is started again on its dataset, and finds what the killed one has left."""
+    for key in KILLED:
+        assert sessions.codes[key] == -signal.SIGKILL
+        assert not sessions.bag(key).exists()
+        graph.start("recorder", f"{key}-again", dataset=sessions.dataset(key))
+    lost_s = {}
+    for key in KILLED:
+        graph.until(sessions.bag(key).exists, f"{key} is recovered")
+        episode = read_episode(sessions.bag(key))
+        assert "recovered" in {f.id for f in episode.findings}
+        sent_ns = stamp_ns(sessions.take.messages[sessions.sent[key] - 1][1])
+        # Played faster than it was made.
+        speed = 20.0 / RATE_HZ
+        lost_s[key] = speed * (sent_ns - int(episode.stamps_ns[-1])) / 1e9
+        assert (sessions.dataset(key) / "quarantine" / f"{sessions.take.id}.partial").is_dir()
+    print(f"lost by kill -9: {', '.join(f'{1e3 * s:.0f} ms' for s in lost_s.values())}")
+    assert max(lost_s.values()) < MOST_LOST_S
+
+
+def test_latched_past_of_a_restarted_recorder_is_no_fault(graph, sessions):
+    for key in KILLED:
+        graph.ready(f"{key}-again")
+        log = graph.log(f"{key}-again")
+        assert "closed" in log
+        assert "[ERROR]" not in log
+        assert not list((sessions.dataset(key) / "episodes" / ".partial").iterdir())
+    graph.stop(*(f"{key}-again" for key in KILLED))
+
+
+def test_known_id_is_refused(graph, robot, sessions):
+    """The owner plays an episode again that the dataset has: its bag stays what it was."""
+    bag = sessions.bag("int")
+    before = {path.name: path.read_bytes() for path in bag.iterdir()}
+    graph.start("recorder", "refusing", dataset=sessions.dataset("int"))
+    graph.ready("refusing")
+    graph.quiet(1.0)  # the killed ones are still counted as subscribers
+    robot.play(sessions.take)
+    graph.ready("refusing", line="the dataset already has this episode")
+    graph.stop("refusing", *TOGETHER)
+    assert {path.name: path.read_bytes() for path in bag.iterdir()} == before

@@ -1,0 +1,172 @@
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from streams import record, same_arrays, short_episode
+
+from curation_ros.configuration import (
+    read_curation,
+    read_reference,
+    share_file,
+    topic_map_or_default,
+)
+from curation_ros.core.errors import BagError, ConfigError
+from curation_ros.core.scorers import SCORERS
+from curation_ros.core.scoring import Curation
+from curation_ros.core.topic_map import read_topic_map
+from curation_ros.dataset import Dataset
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def _write(folder: Path, settings: Any) -> Path:
+    path = folder / "curation.yaml"
+    path.write_text(settings if isinstance(settings, str) else yaml.safe_dump(settings))
+    return path
+
+
+# --- files that we ship -------------------------------------------------------------------------
+
+
+def test_share_file_is_that_of_the_source_tree() -> None:
+    assert share_file("config/topics.yaml") == ROOT / "config" / "topics.yaml"
+
+
+def test_share_file_that_does_not_exist_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"config/none\.yaml"):
+        share_file("config/none.yaml")
+
+
+def test_topic_map_of_an_empty_path_is_that_of_the_libero_robot(tmp_path: Path) -> None:
+    assert topic_map_or_default("") == read_topic_map(ROOT / "config" / "topics.yaml")
+    with pytest.raises(ConfigError, match=str(tmp_path / "none.yaml")):
+        topic_map_or_default(str(tmp_path / "none.yaml"))
+
+
+def test_shipped_config_has_every_scorer_and_makes_a_curation() -> None:
+    curation = read_curation(share_file("config/curation.yaml"), {})
+    assert set(curation.scorers) == set(SCORERS)
+    assert curation.rule_scorer in curation.scorers
+
+
+# --- reading ------------------------------------------------------------------------------------
+
+
+def test_every_key_of_the_file_is_used(tmp_path: Path) -> None:
+    settings = {
+        "scorers": ["knn", "smoothness"],
+        "rule": "threshold",
+        "rule_scorer": "knn",
+        "length": "fixed",
+        "length_value": 50,
+        "scorer_params": {"knn": {"k": 3}},
+        "rule_params": {"threshold": -1.5},
+    }
+    assert set(settings) == set(inspect.signature(Curation).parameters)
+    curation = read_curation(_write(tmp_path, settings), {})
+    assert {key: getattr(curation, key) for key in settings} == {
+        **settings,
+        "scorers": ("knn", "smoothness"),
+    }
+
+
+def test_no_file_takes_the_defaults() -> None:
+    assert vars(read_curation(None, {})) == vars(Curation())
+    assert vars(read_curation(None, {"scorers": None, "rule": ""})) == vars(Curation())
+
+
+def test_override_wins_over_the_file_and_an_empty_one_does_not(tmp_path: Path) -> None:
+    path = _write(tmp_path, {"scorers": ["gripper_timing", "length"], "rule": "threshold"})
+    curation = read_curation(path, {"scorers": (), "rule": "none"})
+    assert (curation.scorers, curation.rule) == (("gripper_timing", "length"), "none")
+
+
+def test_scorer_that_decides_is_added_to_those_that_are_asked_for(tmp_path: Path) -> None:
+    path = _write(tmp_path, {"rule_scorer": "knn"})
+    assert read_curation(path, {"scorers": ["length"]}).scorers == ("length", "knn")
+    assert read_curation(path, {"scorers": ["knn", "length"]}).scorers == ("knn", "length")
+    assert read_curation(None, {"scorers": ["length"]}).scorers == ("length", "gripper_timing")
+    undecided = read_curation(path, {"scorers": ["length"], "rule": "none"})
+    assert undecided.scorers == ("length",)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ("scorers: [", "is not YAML"),
+        ("a: 2020-13-45", "is not YAML"),
+        ("", "expected a mapping, found None"),
+        ("- knn", r"expected a mapping, found \['knn'\]"),
+        ({"nose": 1}, "unknown key 'nose'; known are scorers, rule, "),
+        ({1: 1}, "unknown key 1"),
+        ({"scorers": "knn"}, "'scorers' is 'knn', expected a list"),
+        ({"scorers": None}, "'scorers' is None, expected a list"),
+        ({"scorers": [1]}, r"'scorers' is \[1\], expected names"),
+        ({"scorers": [["knn"]]}, "'scorers' is .* expected names"),
+        ({"scorers": []}, "expected names, each once"),
+        ({"scorers": ["knn", "knn"]}, "expected names, each once"),
+        ({"scorers": ["nose"]}, "no scorer 'nose'; there are smoothness"),
+        ({"rule": ["threshold"]}, "'rule' is .* expected a name"),
+        ({"rule": "nose"}, "no rule 'nose'; there are threshold"),
+        ({"rule_scorer": "nose"}, "rule_scorer 'nose'"),
+        ({"length": "nose"}, "length control 'nose' is none of"),
+        ({"length": "fixed"}, "'fixed' takes steps"),
+        ({"length": "fixed", "length_value": "5"}, "'length_value' is '5', expected a number"),
+        ({"length": "fixed", "length_value": True}, "'length_value' is True"),
+        ({"scorer_params": 5}, "'scorer_params' is 5, expected a mapping"),
+        ({"scorer_params": {"knn": 5}}, "parameters of 'knn' are 5"),
+        ({"scorer_params": {"knn": {1: 2}}}, "parameters of 'knn' are {1: 2}"),
+        ({"scorer_params": {"knn": {"nose": 2}}}, "'knn' has no parameter 'nose'"),
+        ({"scorer_params": {"knn": {"k": "many"}}}, "k is 'many'"),
+        ({"rule_params": [1]}, r"'rule_params' is \[1\], expected a mapping"),
+        ({"rule_params": {"nose": 1}}, "rule 'threshold'.*nose"),
+        ({"rule_params": {"threshold": "high"}}, "rule 'threshold'"),
+        ({"rule_params": {"threshold": float("nan")}}, "not finite"),
+    ],
+)
+def test_config_that_makes_no_sense_is_refused_by_file(
+    tmp_path: Path, settings: Any, said: str
+) -> None:
+    path = _write(tmp_path, settings)
+    with pytest.raises(ConfigError, match=said) as refused:
+        read_curation(path, {})
+    assert str(path) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_config_that_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.yaml", tmp_path):
+        with pytest.raises(ConfigError, match=str(path)):
+            read_curation(path, {})
+
+
+def test_mistake_on_the_command_line_is_not_blamed_on_the_file(tmp_path: Path) -> None:
+    path = _write(tmp_path, {"scorers": ["gripper_timing"]})
+    with pytest.raises(ConfigError, match="no scorer 'nose'") as refused:
+        read_curation(path, {"scorers": ["nose"]})
+    assert str(path) not in str(refused.value)
+
+
+# --- references ---------------------------------------------------------------------------------
+
+
+def test_reference_is_every_bag_of_what_is_named(
+    dataset: Dataset, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    episodes = [short_episode(rng, 3) for _ in range(3)]
+    paths = [record(dataset, e) for e in episodes]
+    for named in ([dataset.path], paths, [dataset.path, paths[0]]):
+        read = {e.id: e for e in read_reference(named, None)}
+        assert set(read) == {e.id for e in episodes}
+        assert all(same_arrays(read[e.id], e) for e in episodes)
+    (tmp_path / "empty").mkdir()
+    for path in (tmp_path / "empty", tmp_path / "none"):
+        with pytest.raises(BagError, match=str(path)):
+            read_reference([path], None)
+    with pytest.raises(ConfigError, match="no episode"):
+        read_reference([], None)
