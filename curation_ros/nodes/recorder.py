@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import time
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, KeyValue
@@ -13,18 +12,16 @@ from std_srvs.srv import SetBool, Trigger
 
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.errors import CurationError
-from curation_ros.core.identity import new_episode_id
 from curation_ros.core.status import (
     ERROR,
     OK,
-    EpisodeEvent,
     Status,
     counts_to_values,
     event_from_status,
-    event_to_status,
 )
 from curation_ros.core.stream import Sample
 from curation_ros.dataset import Dataset
+from curation_ros.nodes.by_hand import Answer, ByHand
 from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import array_to_ros, single_from_ros
 from curation_ros.nodes.parameters import Parameter, declare
@@ -43,6 +40,7 @@ PARAMETERS = (
     Parameter("flush_period_s", 0.1, "at most this much is lost to a kill, s", 0.01, 10.0),
 )
 _STOPPED = "the recorder was stopped"
+_FOLLOWS: Answer = (False, "the recorder follows the episode topic (auto is true)")
 
 
 class Recorder(Node):
@@ -51,17 +49,14 @@ class Recorder(Node):
     def __init__(self) -> None:
         super().__init__("recorder")
         p = declare(self, PARAMETERS)
-        self._auto, self._task = p["auto"], p["task"]
         self._dataset = Dataset(Path(p["dataset"]).expanduser(), create=True)
         self._map = topic_map_or_default(p["topic_map"])
         # Created before the data subscriptions: an executor serves ready ones in that order, so
         # `started` is taken before the samples that follow it.
         self._status = self.create_publisher(DiagnosticArray, "recorder/status", LATCHED)
         self._override = self.create_publisher(KeyValue, "curator/override", EVENTS)
-        if self._auto:
+        if p["auto"]:
             self.create_subscription(DiagnosticArray, "episode", self._on_episode, LATCHED)
-        else:
-            self._episode = self.create_publisher(DiagnosticArray, "episode", LATCHED)
         self._mapped = MappedSubscriptions(self, self._map, self._on_sample)
         self._recording = Recording(
             self._dataset,
@@ -77,11 +72,14 @@ class Recorder(Node):
         self.create_service(Trigger, "~/recover", self._recover)
         self.create_service(SetBool, "~/finalize", self._finalize)
         self._health = Health(self)
-        self._by_hand: EpisodeEvent | None = None
-        self._clock_ns = 0
         self._last_id = ""
         self._tell(recover_partials(self._dataset))
-        self._number = 0 if self._auto else self._last_number()
+        self._by_hand: ByHand | None = None
+        if not p["auto"]:
+            clock = self._mapped.resolved(self._map.clock_topic)
+            self._by_hand = ByHand(
+                self, self._recording, self._tell, task=p["task"], clock_topic=clock
+            )
         self._publish(Status(OK, "recorder", "idle", values={"reason": self._free()}))
 
     # --- messages in ------------------------------------------------------------------------
@@ -96,64 +94,19 @@ class Recorder(Node):
             self._tell(self._recording.event(event, time.monotonic()))
 
     def _on_sample(self, sample: Sample) -> None:
-        if sample.topic == self._map.clock_topic:
-            self._clock_ns = sample.stamp_ns
+        if self._by_hand is not None and sample.topic == self._map.clock_topic:
+            self._by_hand.clock_ns = sample.stamp_ns
         self._tell(self._recording.sample(sample, time.monotonic()))
 
-    # --- driven by hand ---------------------------------------------------------------------
+    # --- services ---------------------------------------------------------------------------
 
     def _start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        clock = self._mapped.resolved(self._map.clock_topic)
-        problem = ""
-        if self._auto:
-            problem = "the recorder follows the episode topic (auto is true)"
-        elif self._by_hand is not None:
-            problem = f"episode {self._by_hand.name} is running: stop it first"
-        elif not self._clock_ns:
-            problem = f"nothing has arrived on {clock}, whose stamps are the episode's clock"
-        if problem:
-            response.message = problem
-            return response
-        name = f"{self._task}-{self._number + 1:04d}"
-        event = EpisodeEvent(new_episode_id(), name, "started", self._clock_ns + 1)
-        notices = self._recording.event(event, time.monotonic())
-        if event.id in self._recording.open_ids:
-            self._number += 1
-            self._by_hand = event
-            self._publish_event(event)
-            response.success = True
-            response.message = json.dumps({"episode": event.id, "name": name})
-        else:
-            response.message = "; ".join(n.reason for n in notices)
-        self._tell(notices)
+        response.success, response.message = self._by_hand.start() if self._by_hand else _FOLLOWS
         return response
 
     def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        started = self._by_hand
-        if started is None:
-            response.message = "no episode was started by ~/start"
-            return response
-        self._end(replace(started, event="ended", end_ns=self._end_ns(started)))
-        response.success = True
-        response.message = json.dumps({"episode": started.id, "name": started.name})
+        response.success, response.message = self._by_hand.stop() if self._by_hand else _FOLLOWS
         return response
-
-    def _end(self, event: EpisodeEvent) -> None:
-        self._by_hand = None
-        self._publish_event(event)
-        self._tell(self._recording.event(event, time.monotonic()))
-
-    def _last_number(self) -> int:
-        named = [name.rpartition("-") for _, name in self._dataset.names()]
-        return max(
-            (int(n) for task, _, n in named if task == self._task and n.isdigit()), default=0
-        )
-
-    def _publish_event(self, event: EpisodeEvent) -> None:
-        self._episode.publish(array_to_ros([event_to_status(event)], self._now()))
-
-    def _end_ns(self, started: EpisodeEvent) -> int:
-        return max(self._clock_ns, started.start_ns)
 
     def _recover(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         notices = recover_partials(self._dataset)
@@ -174,7 +127,7 @@ class Recorder(Node):
             self._override.publish(
                 KeyValue(key=self._last_id, value=f"{verdict} with the recorder's button")
             )
-            if not self._auto:
+            if self._by_hand is not None:
                 self._dataset.append_truth({"episode": self._last_id, "button": verdict})
             response.success, response.message = True, f"{verdict} {self._last_id}"
         return response
@@ -195,12 +148,11 @@ class Recorder(Node):
 
     def close(self) -> None:
         """Close the open bag as aborted, with all it has; who owns the episode says so."""
-        if (started := self._by_hand) is not None:
-            end_ns, reason = self._end_ns(started), f"aborted: {_STOPPED}"
-            self._end(replace(started, event="aborted", end_ns=end_ns, reason=reason))
+        if self._by_hand is not None:
+            self._by_hand.give_up(_STOPPED)
         self._tell(self._recording.abort(_STOPPED))
 
-    def _tell(self, notices: list[Notice]) -> None:
+    def _tell(self, notices: Sequence[Notice]) -> None:
         for n in notices:
             self._last_id = n.id if n.state == "closed" else self._last_id
             level = ERROR if n.state == "failed" else OK
