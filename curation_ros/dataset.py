@@ -236,10 +236,10 @@ class Dataset:
         logs = sorted((self.path / "decisions").glob("*.jsonl"))[-(last or 0) :]
         return in_force(d for log in logs for d in self.decisions(log.stem))
 
-    def start_of(self) -> dict[str, tuple[str, int]]:
-        """Episode id -> (start state, repetition), where a simulator noted them; no labels."""
+    def start_of(self) -> dict[str, tuple[str, str, int]]:
+        """Episode id -> (task, start state, repetition), where they were noted; no labels."""
         return {
-            i: (str(t["start"]), int(t.get("repetition", 0)))
+            i: (str(t.get("task", "")), str(t["start"]), int(t.get("repetition", 0)))
             for i, t in self.truth().items()
             if "start" in t
         }

@@ -22,6 +22,9 @@ Command = tuple[list[float], float]
 #: Yields to the executor: True asks to be called again at once.
 Script = Generator[bool, None, Command]
 
+#: As LIBERO names it.
+TASK = "libero_spatial/0"
+
 _REPEAT_S = 0.5
 _CHECK_S = 1.0
 
@@ -126,6 +129,7 @@ class Run:
             "success_step": self.success_step,
             "stage": self.stage,
             "aborted": self.reason,
+            "task": TASK,
             "start": self.plan.start,
             "repetition": self.plan.repetition,
             "expert_seed": self.plan.expert_seed,

@@ -95,8 +95,8 @@ class SimNode(Node):
         )
 
     def _on_recorder(self, message: DiagnosticArray) -> None:
-        status = message.status[0]
-        self._recorder[status.hardware_id] = status.message.partition(" ")[0]
+        for status in message.status:
+            self._recorder[status.hardware_id] = status.message.partition(" ")[0]
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._driver.reset_wanted = True

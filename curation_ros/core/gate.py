@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from curation_ros.core.status import EpisodeEvent
 from curation_ros.core.stream import NS_PER_S, Sample
@@ -61,7 +61,7 @@ class Closed:
     """An episode whose gate has closed.
 
     Attributes:
-        event: the ended or aborted event.
+        event: the ended or aborted event; its reason notes what was awaited in vain.
         counts: distinct stamps that arrived, by topic.
         missing: topics that were still awaited when the drain time was over.
     """
@@ -176,7 +176,9 @@ class EpisodeGate:
                 continue
             del self._windows[episode_id]
             self._closed.append((window.ended, window.started.start_ns))
-            done.append(Closed(window.ended, window.counts(), tuple(missing)))
+            counts = window.counts()
+            event = _noting(window.ended, [t for t in missing if counts.get(t)])
+            done.append(Closed(event, counts, tuple(missing)))
         return done
 
     def _is_taken(self, sample: Sample, owner: str | None) -> bool:
@@ -192,3 +194,19 @@ class EpisodeGate:
             if event.id == owner:
                 return event.end_ns is None or start_ns <= sample.stamp_ns <= event.end_ns
         return False
+
+
+def _noting(event: EpisodeEvent, missing: Iterable[str]) -> EpisodeEvent:
+    """An ended event that says which topics fell silent before the end.
+
+    Only where the owner has not counted: the builder compares counts itself, and finds topics
+    without any sample. As a line of the reason it goes into the bag, and with a replay.
+    """
+    if event.event != "ended":
+        return event
+    lines = [line for line in event.reason.splitlines() if line]
+    for topic in missing:
+        line = f"incomplete: topic {topic!r} fell silent before the end of the episode"
+        if topic not in event.counts and line not in lines:
+            lines.append(line)
+    return replace(event, reason="\n".join(lines))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from types import TracebackType
 
 import rclpy
@@ -12,6 +13,7 @@ import rclpy.context
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 
+from curation_ros.core.errors import CurationError
 from curation_ros.core.status import EpisodeEvent, Status, event_from_status
 from curation_ros.nodes.messages import single_from_ros
 from curation_ros.nodes.qos import DECISIONS, LATCHED
@@ -62,7 +64,9 @@ class Watcher:
         self._executor.spin_once(timeout_sec=seconds)
 
     def _on_episode(self, message: DiagnosticArray) -> None:
-        self.events.append(event_from_status(single_from_ros(message)))
+        with suppress(CurationError):  # the nodes complain of it
+            self.events.append(event_from_status(single_from_ros(message)))
 
     def _on_decision(self, message: DiagnosticArray) -> None:
-        self.decisions.append(single_from_ros(message))
+        with suppress(CurationError):
+            self.decisions.append(single_from_ros(message))

@@ -252,7 +252,7 @@ def test_episodes_are_found_by_name_and_prefix_from_bags_and_logs(
 def test_truth_of_an_episode_is_merged_and_later_lines_win(dataset: Dataset) -> None:
     assert dataset.truth() == {}
     dataset.append_truth({"episode": "a", "start": "official-01", "outcome": "failed"})
-    dataset.append_truth({"episode": "b", "start": "official-02", "repetition": 3})
+    dataset.append_truth({"episode": "b", "task": "t", "start": "official-02", "repetition": 3})
     dataset.append_truth({"episode": "a", "outcome": "succeeded"})
     dataset.append_truth({"episode": "c", "button": "keep"})
     assert dataset.truth()["a"] == {
@@ -260,7 +260,7 @@ def test_truth_of_an_episode_is_merged_and_later_lines_win(dataset: Dataset) -> 
         "start": "official-01",
         "outcome": "succeeded",
     }
-    assert dataset.start_of() == {"a": ("official-01", 0), "b": ("official-02", 3)}
+    assert dataset.start_of() == {"a": ("", "official-01", 0), "b": ("t", "official-02", 3)}
 
 
 def _tell_often(path: Path, who: str, n: int) -> None:

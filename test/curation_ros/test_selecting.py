@@ -133,7 +133,7 @@ def _with_starts(folder: Path, rng: np.random.Generator, order: list[int]) -> Da
     dataset = Dataset(folder, create=True)
     for episode, k in zip(_scored(dataset, rng, [0.0] * len(order)), order, strict=True):
         dataset.append_truth(
-            {"episode": episode.id, "start": f"official-{k:02d}", "repetition": 1}
+            {"episode": episode.id, "task": "t", "start": f"official-{k:02d}", "repetition": 1}
         )
     return dataset
 
@@ -141,7 +141,7 @@ def _with_starts(folder: Path, rng: np.random.Generator, order: list[int]) -> Da
 def _kept_starts(dataset: Dataset, seed: int, k: int = 3) -> list[str]:
     starts = dataset.start_of()
     kept = _kept(dataset, rule="top-k", value=k, scorer="knn", seed=seed)
-    return [starts[i][0] for i in kept]
+    return [starts[i][1] for i in kept]
 
 
 def test_ties_go_by_start_and_seed_and_not_by_the_order_of_recording(
@@ -155,7 +155,7 @@ def test_ties_go_by_start_and_seed_and_not_by_the_order_of_recording(
     for seed in range(6):
         first, second = (_kept_starts(d, seed) for d in datasets)
         assert first == second
-        keys = sorted(range(6), key=lambda k: tie_key(seed, f"official-{k:02d}", 1))
+        keys = sorted(range(6), key=lambda k: tie_key(seed, "t", f"official-{k:02d}", 1))
         assert first == [f"official-{k:02d}" for k in keys[:3]]
         chosen.add(tuple(first))
     assert len(chosen) > 1

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from curation_ros.core.gate import EpisodeGate
-from curation_ros.core.status import EpisodeEvent
+from curation_ros.core.status import EpisodeEvent, owner_findings
 from curation_ros.core.stream import NS_PER_S, Sample
 
 TOPICS = ("pose", "joints", "twist")
@@ -450,3 +450,18 @@ def test_any_interleaving_of_topics_and_events_accepts_the_same_samples(
         for topic in TOPICS:
             distinct = [t for t, _ in inside if t == topic]
             assert closed[name].counts.get(topic, 0) == len(distinct)
+
+
+def test_drain_timeout_notes_a_topic_that_its_owner_has_not_counted() -> None:
+    gate = EpisodeGate(("a", "b", "c"), max_gap_s=0.25, drain_timeout_s=1.0)
+    gate.event(EpisodeEvent("id", "name", "started", 0), 0.0)
+    for topic, stamp_ns in (("a", 0), ("a", 100), ("b", 0), ("b", 99)):
+        gate.push(Sample(topic, stamp_ns, 0, b""))
+    gate.event(EpisodeEvent("id", "name", "ended", 0, 100), 0.0)
+    assert gate.close_ready(0.9) == []
+    (closed,) = gate.close_ready(1.1)
+    # Topic c never spoke at all: that is the builder's finding.
+    assert closed.missing == ("b", "c")
+    assert [(f.id, f.message) for f in owner_findings(closed.event)] == [
+        ("incomplete", "topic 'b' fell silent before the end of the episode")
+    ]

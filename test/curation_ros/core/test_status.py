@@ -100,6 +100,8 @@ def test_event_survives_status_and_json(event: EpisodeEvent) -> None:
         ({"values": {"start_stamp": "1.5"}}, "1.5"),
         ({"values": {"start_stamp": "1", "end_stamp": ""}}, "end_stamp"),
         ({"values": {"start_stamp": "1", "count/a": "many"}}, "many"),
+        ({"values": {"start_stamp": "-1"}}, "stamp -1"),
+        ({"values": {"start_stamp": "1", "end_stamp": str(2**63)}}, f"stamp {2**63}"),
     ],
 )
 def test_status_that_is_no_event_is_refused(changes: dict[str, Any], said: str) -> None:

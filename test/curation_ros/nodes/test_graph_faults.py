@@ -19,7 +19,8 @@ NODES = ("recorder", "curator")
 def dataset(graph):
     path = graph.folder / "dataset"
     for node in NODES:
-        graph.start(node, dataset=path)
+        # Longer than a message that was dropped takes to come again.
+        graph.start(node, dataset=path, drain_timeout_s=3.5)
     graph.ready(*NODES)
     return path
 
