@@ -38,6 +38,7 @@ except ImportError as err:
 #: For tests: they import from here what needs ROS, so that they are skipped without it.
 __all__ = [
     "DECISIONS",
+    "LATCHED",
     "MAPPED",
     "PATIENCE_S",
     "DescribeParameters",

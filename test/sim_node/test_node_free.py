@@ -1,0 +1,110 @@
+"""The sim node that runs freely, owned by nobody, with a person at the commands."""
+
+from __future__ import annotations
+
+import signal
+
+import numpy as np
+import pytest
+from commander import COMMANDS, Commander
+from graph import MAPPED, DescribeParameters, PoseStamped, Trigger
+from robot import stamp_ns
+
+from curation_ros.bags.reader import open_bag, read_episode
+
+pytestmark = [pytest.mark.ros, pytest.mark.sim]
+pytest.importorskip("libero", reason="LIBERO is not installed")
+
+
+@pytest.fixture(scope="module")
+def free(graph):
+    """Nobody's episodes, on and on at five times real time, and a recorder driven by hand."""
+    dataset = graph.folder / "free"
+    graph.start(
+        "sim_node",
+        "free_sim",
+        mode="command",
+        sync="free",
+        episodes=0,
+        starts="generated:0:1",
+        max_steps=100_000,
+        realtime_factor=5.0,
+        hold_timeout_s=0.4,
+    )
+    graph.start(
+        "recorder", "free_recorder", {"__node": "free_recorder"}, dataset=dataset, auto=False
+    )
+    seen = []
+    graph.node.create_subscription(PoseStamped, "eef_pose", seen.append, MAPPED)
+    commander = Commander(graph, "person")
+    graph.until(lambda: commander.twist.get_subscription_count() >= 2 and seen, "sim and recorder")
+    graph.quiet(0.5)
+    yield dataset, commander, seen
+    commander.close()
+
+
+def by_hand(graph, service):
+    answer = graph.call(Trigger, f"free_recorder/{service}", Trigger.Request())
+    assert answer.success, answer.message
+    return answer
+
+
+def test_free_command_is_held_and_then_zeroed(graph, free):
+    dataset, commander, seen = free
+    by_hand(graph, "start")
+    graph.quiet(0.2)
+    commander.say(seen[-1], z=1.0)
+    commanded_ns = stamp_ns(seen[-1])
+    graph.quiet(1.2)
+    end_ns = stamp_ns(seen[-1])
+    by_hand(graph, "stop")
+    episode_id = next(reversed(graph.events)).id
+    graph.recorded(episode_id)
+    poses = [(stamp_ns(m), m.pose.position.z) for m in seen]
+    stamps, height = (np.array(column) for column in zip(*poses, strict=True))
+    at = np.searchsorted(stamps, commanded_ns)
+    # Five times real time: held for 0.4 s, which are 2 s of the arm.
+    assert height[np.searchsorted(stamps, commanded_ns + int(1.5e9))] - height[at] > 0.05
+    assert end_ns - commanded_ns > int(4.5e9)
+    assert np.ptp(height[np.searchsorted(stamps, commanded_ns + int(4e9)) :]) < 0.005
+    bag = open_bag(dataset / "episodes" / episode_id)
+    assert bag.topics[f"/{COMMANDS[0]}"].count == 1
+
+
+def test_sim_that_owns_no_episode_does_not_say_so(graph, free):
+    owners = graph.node.get_publishers_info_by_topic("episode")
+    assert [info.node_name for info in owners] == ["free_recorder"]
+
+
+def test_reset_inside_an_episode_of_somebody_else(graph, free):
+    dataset, _, seen = free
+    by_hand(graph, "start")
+    graph.quiet(0.2)
+    graph.call(Trigger, "sim_node/reset", Trigger.Request())
+    n = len(seen)
+    graph.until(lambda: len(seen) > n + 10, "the sim goes on")
+    by_hand(graph, "stop")
+    episode_id = next(reversed(graph.events)).id
+    graph.recorded(episode_id)
+    episode = read_episode(dataset / "episodes" / episode_id)
+    assert "clock-back" not in {f.id for f in episode.findings}
+    assert (np.diff(episode.stamps_ns) > 0).all()
+
+
+def test_parameters_are_described_and_read_only(graph, free):
+    from sim_node.node import PARAMETERS
+
+    names = [p.name for p in PARAMETERS]
+    request = DescribeParameters.Request(names=names)
+    described = graph.call(DescribeParameters, "sim_node/describe_parameters", request)
+    assert [d.name for d in described.descriptors] == names
+    assert all(d.description and d.read_only for d in described.descriptors)
+    ranges = {d.name: d.floating_point_range for d in described.descriptors}
+    assert ranges["contamination"][0].to_value == 1.0
+
+
+def test_stopped_free_sim_ends_cleanly(graph, free):
+    graph.nodes.send("free_sim", signal.SIGTERM)
+    code, log = graph.expect_exit("free_sim")
+    assert code == 0
+    assert "Traceback" not in log

@@ -1,0 +1,161 @@
+"""The sim node in lockstep with a commander that does what it should not, too."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from commander import COMMANDS, Commander
+from graph import LATCHED, MAPPED, DiagnosticArray, PoseStamped, Trigger
+
+from curation_ros.bags.reader import read_episode
+from curation_ros.dataset import Dataset
+
+pytestmark = [pytest.mark.ros, pytest.mark.sim]
+pytest.importorskip("libero", reason="LIBERO is not installed")
+
+PERIOD_NS = 50_000_000
+MAX_STEPS = 12
+
+
+@pytest.fixture(scope="module")
+def lockstep(graph):
+    """A sim node that waits for commands; tests answer it, one episode after the other."""
+    dataset = graph.folder / "lockstep"
+    graph.start("recorder", "lockstep_recorder", dataset=dataset)
+    graph.start(
+        "sim_node",
+        "lockstep_sim",
+        dataset=dataset,
+        mode="command",
+        task="lockstep",
+        episodes=7,
+        starts="generated:0:1",
+        max_steps=MAX_STEPS,
+        command_timeout_s=1.2,
+        wait_for=["recorder", "commander"],
+    )
+    commander = Commander(graph)
+    seen = []
+    commander.node.create_subscription(PoseStamped, "eef_pose", seen.append, MAPPED)
+    # Who is waited for listens to the episodes, too.
+    commander.node.create_subscription(DiagnosticArray, "episode", lambda _: None, LATCHED)
+    graph._executor.add_node(commander.node)
+    yield Lockstep(graph, dataset, commander, seen)
+    graph._executor.remove_node(commander.node)
+    commander.close()
+    code, log = graph.expect_exit("lockstep_sim")
+    assert code == 0, log
+    graph.stop("lockstep_recorder")
+
+
+class Lockstep:
+    def __init__(self, graph, dataset, commander, seen):
+        self.graph = graph
+        self.dataset = dataset
+        self.commander = commander
+        self.seen = seen
+        self.n = 0
+
+    def observation(self):
+        """The next observation."""
+        self.graph.until(lambda: self.seen, "an observation")
+        return self.seen.pop(0)
+
+    def answer(self, steps, **how):
+        """Answer so many observations; repeated ones as they come."""
+        for _ in range(steps):
+            self.commander.say(self.observation(), **how)
+
+    def end(self):
+        """The event that ends the running episode, and its bag."""
+        event = self.graph.until(
+            lambda: next(
+                iter([e for e in self.graph.events if e.event != "started"][self.n :]), 0
+            ),
+            f"end of episode {self.n}",
+        )
+        self.n += 1
+        status = self.graph.recorded(event.id)
+        assert status.message.startswith("closed "), status
+        return event, read_episode(self.dataset / "episodes" / event.id)
+
+
+def test_late_answer_is_asked_for_again(graph, lockstep):
+    lockstep.answer(4)
+    first = lockstep.observation()
+    again = lockstep.observation()  # after half a second
+    assert (again.header, again.pose) == (first.header, first.pose)
+    lockstep.commander.say(again)
+    lockstep.commander.say(again)
+    lockstep.answer(MAX_STEPS - 5)
+    event, episode = lockstep.end()
+    assert (event.event, len(episode)) == ("ended", MAX_STEPS)
+    assert set(event.counts.values()) == {MAX_STEPS}
+    assert episode.findings == ()
+    # The bag may hold what was sent twice; the episode has one sample a stamp.
+    assert np.unique(np.diff(episode.stamps_ns)).tolist() == [PERIOD_NS]
+
+
+def test_command_that_never_comes_aborts_the_episode(graph, lockstep):
+    lockstep.answer(4)
+    event, episode = lockstep.end()
+    lockstep.seen.clear()
+    assert event.event == "aborted"
+    assert event.reason == ("aborted: no answer on command/twist and command/gripper within 1.2 s")
+    assert event.end_ns == event.start_ns + 3 * PERIOD_NS
+    assert set(event.counts.values()) == {4}
+    assert {f.id for f in episode.findings} == {"aborted"}
+    assert len(episode) == 4
+    assert Dataset(lockstep.dataset).truth()[event.id]["aborted"] == event.reason[9:]
+
+
+def test_half_a_command_is_none(graph, lockstep):
+    lockstep.answer(1)
+    lockstep.answer(1, gripper="")
+    event, episode = lockstep.end()
+    lockstep.seen.clear()
+    assert event.reason == "aborted: no answer on command/gripper within 1.2 s"
+    assert (event.counts[COMMANDS[0]], event.counts[COMMANDS[1]]) == (1, 1)
+    assert len(episode) == 1
+
+
+def test_gripper_command_without_its_joint_aborts(graph, lockstep):
+    lockstep.answer(2)
+    lockstep.answer(1, gripper="thumb")
+    event, _ = lockstep.end()
+    assert event.reason == "aborted: command/gripper has no position of joint 'gripper'"
+
+
+def test_second_commander_aborts_in_mid_episode(graph, lockstep):
+    lockstep.answer(2)
+    observation = lockstep.observation()
+    rival = Commander(graph, "rival")
+    graph.quiet(1.1)
+    lockstep.seen.clear()
+    lockstep.commander.say(observation)
+    event, _ = lockstep.end()
+    rival.close()
+    assert event.reason == (
+        "aborted: commands come from commander and rival (4 publishers): stop all but one"
+    )
+    lockstep.seen.clear()
+
+
+def test_reset_gives_the_episode_up(graph, lockstep):
+    lockstep.answer(3)
+    answer = graph.call(Trigger, "sim_node/reset", Trigger.Request())
+    assert answer.success
+    event, _ = lockstep.end()
+    assert event.reason == "aborted: reset was asked for"
+    lockstep.seen.clear()
+
+
+def test_next_episode_runs_after_all_that(graph, lockstep):
+    assert graph.nodes.ended("lockstep_sim") is None
+    lockstep.answer(MAX_STEPS)
+    event, episode = lockstep.end()
+    assert (event.event, event.name, len(episode)) == ("ended", "lockstep-0007", MAX_STEPS)
+    starts = [e.start_ns for e in graph.events if e.event == "started"]
+    assert all(a < b for a, b in pairwise(starts))
