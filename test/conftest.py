@@ -13,6 +13,11 @@ import pytest
 _MARK = "CURATION_ROS_TEST"
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of the graph come last: DDS leaves threads behind, and who then forks may hang."""
+    items.sort(key=lambda item: item.get_closest_marker("ros") is not None)
+
+
 @pytest.fixture(scope="module")
 def graph(tmp_path_factory, no_process_left):
     """A ROS graph on a domain of its own; its nodes end with the module."""

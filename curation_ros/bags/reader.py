@@ -24,6 +24,8 @@ from curation_ros.core.status import EpisodeEvent, EventKind, event_from_json, o
 from curation_ros.core.stream import Sample, header_stamp_ns
 from curation_ros.core.topic_map import TopicMap, topic_map_from_json
 
+_UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+
 
 @dataclass(frozen=True)
 class BagTopic:
@@ -341,7 +343,9 @@ def _is_split(folder: Path, files: Sequence[Path]) -> bool:
 
 
 def _natural(path: Path) -> tuple[tuple[int, str], ...]:
-    """Sort key under which part 10 follows part 9."""
+    """Sort key under which part 10 follows part 9, and episodes follow the time of their ids."""
+    if _UUID.fullmatch(path.stem):
+        return ((-1, path.stem),)
     pieces = re.findall(r"\d+|\D+", path.name)
     return tuple((int(p), "") if p.isdigit() and p.isascii() else (-1, p) for p in pieces)
 

@@ -32,7 +32,12 @@ def free(graph):
         hold_timeout_s=0.4,
     )
     graph.start(
-        "recorder", "free_recorder", {"__node": "free_recorder"}, dataset=dataset, auto=False
+        "recorder",
+        "free_recorder",
+        {"__node": "free_recorder"},
+        dataset=dataset,
+        auto=False,
+        drain_timeout_s=1.0,  # commands fall silent
     )
     seen = []
     graph.node.create_subscription(PoseStamped, "eef_pose", seen.append, MAPPED)

@@ -454,3 +454,12 @@ def test_find_bags_expands_datasets_folders_and_files(tmp_path: Path) -> None:
         find_bags([dataset, dataset / "episodes" / "notes"])
     with pytest.raises(BagError, match="no such path"):
         find_bags([tmp_path / "nowhere"])
+
+
+def test_episodes_are_found_in_the_order_of_their_ids(tmp_path: Path) -> None:
+    ids = ["01a20164-99af-7f9c-803d-7ad12c0caf76", "01a20164-9be8-79b2-a1b7-789d4261dc45"]
+    for episode_id in ids:
+        folder = tmp_path / "episodes" / episode_id
+        folder.mkdir(parents=True)
+        (folder / "metadata.yaml").touch()
+    assert [path.name for path in find_bags([tmp_path])] == ids

@@ -20,6 +20,8 @@ pytestmark = pytest.mark.ros
 
 ARM = ("shoulder", "elbow", "wrist")
 NAMESPACE = "/left_arm"
+#: Stamps a second; a step has four.
+RATE_HZ = 1600.0
 # The map says `joints`; on this robot's graph a driver calls it otherwise.
 DRIVER = "driver/joint_states"
 MAP = {
@@ -96,7 +98,7 @@ def recorded(graph):
         graph.start("recorder", "reference", remaps, dataset=reference, topic_map=map_file)
         robot.until_heard()
         for k in range(3):
-            played = robot.play(take(k, f"reference-{k}"))
+            played = robot.play(take(k, f"reference-{k}"), rate_hz=RATE_HZ)
             assert graph.recorded(played.id).message.startswith("closed ")
         graph.stop("reference")
         graph.start("recorder", "recorder", remaps, dataset=dataset, topic_map=map_file)
@@ -105,8 +107,9 @@ def recorded(graph):
             reference=[reference],
         )  # fmt: skip
         robot.until_heard(2)
-        takes = [robot.play(take(10, "good")), robot.play(take(11, "early", open_at=45))]
+        takes = [take(10, "good"), take(11, "early", open_at=45)]
         for one in takes:
+            robot.play(one, rate_hz=RATE_HZ)
             graph.settled(dataset, one.id)
     return dataset, reference, takes
 

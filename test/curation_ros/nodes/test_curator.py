@@ -121,7 +121,7 @@ def test_restarted_curator_changes_no_decision(graph, dataset, takes):
     logs = {log.name: log.read_text() for log in (dataset / "decisions").glob("*.jsonl")}
     graph.stop("curator")
     graph.decisions.clear()
-    graph.start("curator", "curator-again", dataset=dataset)
+    graph.start("curator", "curator-again", dataset=dataset, drain_timeout_s=1.0)
     graph.decided(takes[-1].id)
     graph.quiet(1.0)
     assert "[ERROR]" not in graph.log("curator-again")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 
 import pytest
 from episodes import topic_map
@@ -93,6 +94,7 @@ def test_truncated_bag_is_named_and_the_others_are_played(graph, dataset):
         for seed in (4, 5, 6):
             ids.append(robot.play(libero_take(seed)).id)
             graph.settled(dataset, ids[-1])
+            graph.decided(ids[-1])
     copy = graph.folder / "copy"
     for episode_id in ids:
         shutil.copytree(dataset / "episodes" / episode_id, copy / episode_id)
@@ -116,3 +118,26 @@ def test_truncated_bag_is_named_and_the_others_are_played(graph, dataset):
         (ids[2], "started"),
         (ids[2], "ended"),
     ]
+
+
+def test_bag_of_a_stopped_recorder_outranks_what_went_on(graph, dataset):
+    """Training reads bags: what the recorder has not seen is not in the decision either."""
+    take = libero_take(7)
+    half = take.until(0.5)
+    with Robot(graph) as robot:
+        robot.until_heard(2)
+        robot.tell(take.started)
+        robot.send(take.messages[:half])
+        graph.quiet(0.3)
+        graph.nodes.send("recorder", signal.SIGTERM)
+        code, _ = graph.expect_exit("recorder")
+        assert code == 0
+        first = graph.settled(dataset, take.id)
+        assert first.reason == "aborted: the recorder was stopped"
+        robot.send(take.messages[half:])
+        robot.tell(take.ended)
+        graph.until(
+            lambda: [s for s in graph.health if s.name == "curator"][-1].hardware_id == "",
+            "the curator has closed the episode",
+        )
+    assert [d.evidence["bag"] for d in Dataset(dataset).decisions(take.id)] == ["alone"]

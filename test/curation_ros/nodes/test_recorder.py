@@ -78,10 +78,13 @@ def sessions(graph, robot):
 
 
 def test_two_recorders_on_one_dataset_make_one_bag(graph, sessions):
+    # The bag is there a moment before the recorder says so.
+    closed = f"closed {sessions.take.name}"
+    graph.until(lambda: any(closed in graph.log(key) for key in TOGETHER), closed)
     said = {key: graph.log(key) for key in TOGETHER}
     idle = [key for key in TOGETHER if "another recorder has this episode" in said[key]]
     assert len(idle) == 1
-    assert [key for key in TOGETHER if f"closed {sessions.take.name}" in said[key]] == [
+    assert [key for key in TOGETHER if closed in said[key]] == [
         key for key in TOGETHER if key not in idle
     ]
     assert all(graph.nodes.ended(key) is None for key in TOGETHER)

@@ -1,0 +1,225 @@
+"""The policy node: how it answers, and that the graph goes the same way as one process."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from episodes import topic_map
+from graph import MAPPED, JointState, TwistStamped
+from robot import Robot, libero_take, plain, stamp_ns
+from test_policy import policy
+
+from curation_ros.bags.reader import read_episode
+from curation_ros.cli.main import main as curation
+
+pytestmark = [pytest.mark.ros, pytest.mark.policy]
+sim = pytest.mark.sim
+
+COMMANDS = ("command/twist", "command/gripper")
+MAX_STEPS = 30
+START = "generated:5:1"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A policy with random weights: it moves, and every wrong number shows."""
+    return policy().save(tmp_path_factory.mktemp("policies") / "p")
+
+
+# --- answering ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def answers(graph, folder):
+    """A robot without commands of its own, and what the policy node has answered."""
+    graph.start("policy_node", policy=folder)
+    graph.ready("policy_node")
+    heard = {topic: [] for topic in COMMANDS}
+    for topic, kind in zip(COMMANDS, (TwistStamped, JointState), strict=True):
+        graph.node.create_subscription(kind, topic, heard[topic].append, MAPPED)
+    types = {t: kind for t, kind in topic_map().topics.items() if t not in COMMANDS}
+    with Robot(graph, types=types) as robot:
+        robot.until_heard(heard=["eef_pose", "phase"])
+        yield Answers(graph, robot, heard)
+    graph.stop("policy_node")
+
+
+class Answers:
+    def __init__(self, graph, robot, heard):
+        self.graph = graph
+        self.robot = robot
+        self.heard = heard
+
+    def begin(self):
+        """Start an episode; returns the messages of its steps."""
+        take = libero_take(0, 6)
+        observations = [s for s in take.messages if s[0] not in COMMANDS]
+        n = len(observations) // 6
+        steps = [observations[k : k + n] for k in range(0, len(observations), n)]
+        # The first observation is at the start stamp, as the sim has it.
+        started = type(take.started)(take.id, take.name, "started", stamp_ns(observations[0][1]))
+        for commands in self.heard.values():
+            commands.clear()
+        self.robot.tell(started)
+        return steps
+
+    def until(self, n):
+        self.graph.until(lambda: all(len(c) >= n for c in self.heard.values()), f"{n} answers")
+        return [plain(self.heard[topic][n - 1]) for topic in COMMANDS]
+
+
+def test_answers_carry_the_stamp_of_their_observation(answers):
+    for n, step in enumerate(answers.begin(), 1):
+        answers.robot.send(step)
+        twist, gripper = answers.until(n)
+        assert twist["header"]["stamp"] == gripper["header"]["stamp"]
+        assert stamp_ns(answers.heard[COMMANDS[0]][-1]) == stamp_ns(step[0][1])
+        assert gripper["name"] == ["gripper"]
+        assert gripper["position"][0] in (-1.0, 0.0, 1.0)
+        assert all(abs(v) <= 1.0 for v in twist["twist"]["linear"].values())
+
+
+def test_repeated_observation_gets_the_same_command(answers):
+    steps = answers.begin()
+    answers.robot.send(steps[0])
+    first = answers.until(1)
+    answers.robot.send(steps[1])
+    second = answers.until(2)
+    answers.robot.send(steps[1])
+    assert answers.until(3) == second
+    answers.robot.send(steps[2])
+    assert answers.until(4) != second != first
+
+
+def test_incomplete_observation_waits_for_its_last_topic(answers):
+    first, second, *_ = answers.begin()
+    *others, tool = first
+    answers.robot.send([*others, *second[:-1]])  # of the next one something is there already
+    answers.graph.quiet(0.3)
+    assert not answers.heard[COMMANDS[0]]
+    answers.robot.send([tool])
+    answers.until(1)
+    assert stamp_ns(answers.heard[COMMANDS[0]][0]) == stamp_ns(first[0][1])
+
+
+def test_episode_joined_in_its_middle_is_not_driven(answers):
+    steps = answers.begin()
+    answers.robot.send(steps[3])
+    answers.graph.problem("policy_node", "its first observation was not seen: not driving it")
+    assert not answers.heard[COMMANDS[0]]
+
+
+# --- driving --------------------------------------------------------------------------------
+
+
+@sim
+def test_graph_and_one_process_go_the_same_way(graph, answers, folder, request):
+    """The same policy from the same start: equal observations and commands, to the last bit."""
+    pytest.importorskip("libero", reason="LIBERO is not installed")
+    from policy_node.policy import Policy
+    from policy_node.rollouts import field_values
+    from sim_node.env import LiberoEnv
+    from sim_node.starts import parse_starts
+
+    dataset = graph.folder / "driven"
+    answers.robot.node.destroy_node()
+    graph.events.clear()
+    graph.start("recorder", dataset=dataset)
+    graph.start(
+        "sim_node",
+        mode="command",
+        starts=START,
+        max_steps=MAX_STEPS,
+        wait_for=["policy_node", "recorder"],
+    )
+    code, log = graph.expect_exit("sim_node")
+    assert code == 0, log
+    episode_id = next(e.id for e in graph.events if e.event == "ended")
+    driven = read_episode(dataset / "episodes" / episode_id)
+
+    from policy_node.rollouts import _SimController
+    from sim_node.episodes import run_episode
+
+    steps = []
+    with LiberoEnv() as env:
+        run_episode(
+            env,
+            parse_starts(START)[0],
+            _SimController(Policy.load(folder)),
+            max_steps=MAX_STEPS,
+            on_step=steps.append,
+        )
+    assert len(driven) == len(steps) == MAX_STEPS
+    np.testing.assert_array_equal(driven.field("twist"), [s.action_xyz for s in steps])
+    np.testing.assert_array_equal(driven.field("gripper")[:, 0], [s.gripper for s in steps])
+    np.testing.assert_array_equal(driven.field("phase")[:, 0], [s.phase_index for s in steps])
+    for name in field_values(steps[0].observation):
+        expected = [field_values(s.observation)[name] for s in steps]
+        np.testing.assert_array_equal(driven.field(name), expected)
+
+
+@sim
+def test_evaluate_on_the_graph_prints_rows_as_in_one_process(folder, capsys):
+    pytest.importorskip("libero", reason="LIBERO is not installed")
+    words = ["evaluate", "--policy", str(folder), "--starts", "generated:5:2", "--json"]
+    words += ["--max-steps", str(MAX_STEPS)]
+    assert curation([*words, "--graph"]) == 0
+    on_graph = capsys.readouterr().out
+    assert curation(words) == 0
+    assert on_graph == capsys.readouterr().out
+    *rows, summary = (json.loads(line) for line in on_graph.splitlines())
+    assert [row["start"] for row in rows] == ["generated-5-000", "generated-5-001"]
+    for row in rows:
+        assert set(row) == {"policy", "start", "success", "steps", "stage"}
+        assert (row["success"], row["steps"]) == (False, MAX_STEPS)
+    assert (summary["successes"], summary["rollouts"], summary["interval"]) == (0, 2, "wilson")
+    assert summary["ci95"][0] == 0.0
+
+
+# --- errors ---------------------------------------------------------------------------------
+
+
+def without_bowl():
+    raw = topic_map().to_json()
+    del raw["fields"]["bowl_position"]
+    raw["state"] = [c for c in raw["state"] if not c.startswith("bowl_position")]
+    return raw
+
+
+def in_millimetres():
+    raw = topic_map().to_json()
+    raw["fields"]["eef_position"]["unit"] = "mm"
+    return raw
+
+
+@pytest.fixture(scope="module")
+def refused(graph, folder):
+    """Name -> (exit code, output) of nodes that ought to refuse."""
+    empty = graph.folder / "empty"
+    empty.mkdir()
+    parameters = {"empty_folder": {"policy": empty}}
+    for change in (without_bowl, in_millimetres):
+        path = graph.folder / f"{change.__name__}.yaml"
+        path.write_text(yaml.safe_dump(change()))
+        parameters[change.__name__] = {"policy": folder, "topic_map": path}
+    for name, given in parameters.items():
+        graph.start("policy_node", name, **given)
+    return {name: graph.expect_exit(name) for name in parameters}
+
+
+@pytest.mark.parametrize(
+    ("name", "complaint"),
+    [
+        ("without_bowl", "'bowl_position'"),
+        ("in_millimetres", "'eef_position'"),
+        ("empty_folder", "empty"),
+    ],
+)
+def test_policy_that_does_not_fit_is_one_line_and_code_2(refused, name, complaint):
+    code, log = refused[name]
+    assert (code, len(log.splitlines())) == (2, 1)
+    assert log.startswith("error: ")
+    assert complaint in log
