@@ -118,8 +118,9 @@ class SimNode(Node):
             raise Finished from None
 
     def close(self) -> None:
-        """Give up the running episode, saying so."""
+        """Give up the running episode, and see that everybody hears how it ended."""
         self._script.close()
+        self._out.flush()
         self._env.close()
 
     def _play(self) -> Generator[bool, None, None]:
@@ -136,7 +137,6 @@ class SimNode(Node):
                 self._report(episode)
                 yield from self._until_recorder(episode.id, "closed", "failed")
             if self._p["episodes"]:
-                self._out.flush()
                 return
 
     def _announced(self, episode_id: str) -> Iterator[bool]:

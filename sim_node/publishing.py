@@ -6,12 +6,12 @@ from collections.abc import Iterable
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TwistStamped
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from curation_ros.core.status import EpisodeEvent, Status, event_to_status, phase_to_status
+from curation_ros.nodes.delivery import deliver
 from curation_ros.nodes.matching import Matching
 from curation_ros.nodes.messages import (
     array_to_ros,
@@ -26,7 +26,6 @@ from sim_node.phases import PhaseTracker
 
 COMMAND_TOPICS = ("command/twist", "command/gripper")
 GRIPPER_JOINT = "gripper"
-_ACKNOWLEDGED = Duration(seconds=5)
 
 
 class SimPublishers:
@@ -116,10 +115,10 @@ class SimPublishers:
         return " and ".join(sorted(name for _, name in owners)) + f" ({len(infos)} publishers)"
 
     def flush(self) -> None:
-        """Wait until every subscriber has everything."""
-        for publisher in (self._eef, self._joints, self._phase, self._episode, self._outcome):
-            if publisher is not None:
-                publisher.wait_for_all_acked(_ACKNOWLEDGED)
+        """Wait until every subscriber has everything of our episodes."""
+        if self._episode is not None:
+            observations = (self._joints, *self._objects.values(), self._phase, self._eef)
+            deliver([self._episode, self._outcome, *observations])
 
     def is_matched(self, node_name: str) -> bool:
         """Whether a node is there, with all its subscriptions, to `episode` too if it is ours."""

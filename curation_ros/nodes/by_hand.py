@@ -12,6 +12,7 @@ from rclpy.node import Node
 
 from curation_ros.core.identity import new_episode_id
 from curation_ros.core.status import EpisodeEvent, event_to_status
+from curation_ros.nodes.delivery import deliver
 from curation_ros.nodes.messages import array_to_ros
 from curation_ros.nodes.qos import LATCHED
 from curation_ros.recording import Notice, Recording
@@ -85,9 +86,10 @@ class ByHand:
         return True, json.dumps({"episode": started.id, "name": started.name})
 
     def give_up(self, reason: str) -> None:
-        """Abort the running episode, if there is one."""
+        """Abort the running episode, if there is one, and see that everybody hears of it."""
         if self._running is not None:
             self._end(replace(self._running, event="aborted", reason=f"aborted: {reason}"))
+            deliver([self._episode])
 
     def _end(self, event: EpisodeEvent) -> None:
         self._running = None

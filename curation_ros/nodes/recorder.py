@@ -22,6 +22,7 @@ from curation_ros.core.status import (
 from curation_ros.core.stream import Sample
 from curation_ros.dataset import Dataset
 from curation_ros.nodes.by_hand import Answer, ByHand
+from curation_ros.nodes.delivery import deliver
 from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import array_to_ros, single_from_ros
 from curation_ros.nodes.parameters import Parameter, declare
@@ -148,9 +149,12 @@ class Recorder(Node):
 
     def close(self) -> None:
         """Close the open bag as aborted, with all it has; who owns the episode says so."""
+        was_open = bool(self._recording.open_ids)
         if self._by_hand is not None:
             self._by_hand.give_up(_STOPPED)
         self._tell(self._recording.abort(_STOPPED))
+        if was_open:  # the curator must hear of it: it judges the bag, not what went on
+            deliver([self._status])
 
     def _tell(self, notices: Sequence[Notice]) -> None:
         for n in notices:

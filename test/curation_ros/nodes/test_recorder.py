@@ -56,10 +56,10 @@ class Sessions:
                 self.graph.quiet(0.3)  # it has taken everything
             self.graph.nodes.send(key, number)
             if key in SIGNALS:
-                self.codes[key], _ = self.graph.expect_exit(key)
+                self.graph.until(self.bag(key).exists, f"the bag of {key}")
         robot.send(messages[done:], rate_hz=RATE_HZ)
         robot.tell(self.take.ended)
-        for key in KILLED:
+        for key in (*SIGNALS, *KILLED):
             self.codes[key], _ = self.graph.expect_exit(key)
         self.graph.until(self.bag("first").exists, "the whole bag")
 
