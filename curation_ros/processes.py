@@ -85,6 +85,8 @@ def _is_in_use(domain_id: int) -> bool:
 
 def _die_with_parent() -> None:
     # Linux only; elsewhere children outlive a parent that was killed.
+    # Who was started in the background by a shell ignores SIGINT, and so would its children.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     if _PRCTL is not None:
         _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)
 

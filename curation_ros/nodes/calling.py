@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import rclpy
+from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
 from curation_ros.core.errors import CurationError
@@ -17,7 +18,8 @@ def call_recorder(recorder: str, action: str, timeout_s: float) -> tuple[bool, s
     Raises:
         CurationError: if no recorder answers in time.
     """
-    rclpy.init()
+    # With its handlers rclpy would leave the caller deaf to SIGTERM for good, also after shutdown.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = rclpy.create_node("curation_record")
         if action in ("keep", "discard"):
