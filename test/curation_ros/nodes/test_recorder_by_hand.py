@@ -146,6 +146,7 @@ def test_start_twice_and_stop_twice_are_refused(graph, dataset, stream, capsys):
 def test_stopped_in_mid_episode_the_owner_says_so(graph, dataset, stream):
     started = json.loads(by_hand(graph, "start").message)
     stream.go_on(15)
+    graph.quiet(0.5)  # it has taken everything
     graph.nodes.send("recorder", signal.SIGINT)
     code, log = graph.expect_exit("recorder")
     assert code == 0, log
