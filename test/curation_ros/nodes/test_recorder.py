@@ -152,9 +152,7 @@ def test_kill_costs_a_fraction_of_a_second(graph, robot, sessions):
         kept = sessions.dataset(key) / "quarantine" / f"{sessions.take.id}.partial"
         graph.until(kept.is_dir, "the torn original")  # moved after the new bag is there
     print(f"lost by kill -9: {', '.join(f'{1e3 * s:.0f} ms' for s in lost_s.values())}")
-    # The middle one: on a busy machine a recorder may lag when it is killed, and what it has not
-    # taken yet is no matter of its flushing. benchmarks/kill_cost.py has the worst of many.
-    assert sorted(lost_s.values())[len(lost_s) // 2] < MOST_LOST_S
+    assert max(lost_s.values()) < MOST_LOST_S
 
 
 def test_latched_past_of_a_restarted_recorder_is_no_fault(graph, sessions):
