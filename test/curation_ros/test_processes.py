@@ -124,7 +124,7 @@ def test_domain_on_which_somebody_listens_is_not_taken(monkeypatch: pytest.Monke
 def test_node_gets_its_parameters_and_its_domain(told: Path, domain: Domain) -> None:
     parameters = {
         "name": "rich",
-        "folder": Path("/tmp/a 'b' c"),
+        "folder": Path("/data/a 'b' c"),
         "flag": True,
         "number": 3,
         "ratio": 0.5,
@@ -143,7 +143,7 @@ def test_node_gets_its_parameters_and_its_domain(told: Path, domain: Domain) -> 
     assert flag == "--ros-args"
     values = dict(p.split(":=", 1) for p in pairs if p != "-p")
     read: dict[str, Any] = {k: yaml.safe_load(v) for k, v in values.items()}
-    assert read == {**parameters, "folder": "/tmp/a 'b' c"}
+    assert read == {**parameters, "folder": "/data/a 'b' c"}
 
 
 def test_nodes_are_stopped_in_reverse_order_and_none_is_left(told: Path, domain: Domain) -> None:
