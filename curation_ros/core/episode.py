@@ -142,8 +142,20 @@ class Episode:
 
         Never of CDR bytes: their padding is uninitialised memory.
         """
-        h = hashlib.sha256(f"{self.id}:{self.start_ns}:{self.end_ns}".encode())
-        h.update(self.stamps_ns.astype("<i8").tobytes())
+        return self._hashed(f"{self.id}:{self.start_ns}:{self.end_ns}", self.stamps_ns)
+
+    @property
+    def content_digest(self) -> str:
+        """SHA-256 over decoded values and stamps from the first one, without identity or window.
+
+        Equal for two copies of one recording, whatever they are called and whenever they claim to
+        have happened. All episodes without a step have the same one.
+        """
+        return self._hashed("", self.stamps_ns - self.stamps_ns[:1])
+
+    def _hashed(self, identity: str, stamps_ns: Stamps) -> str:
+        h = hashlib.sha256(identity.encode())
+        h.update(stamps_ns.astype("<i8").tobytes())
         for name in sorted(self.fields):
             h.update(f"{name}{self.fields[name].shape}".encode())
             h.update(self.fields[name].astype("<f8").tobytes())

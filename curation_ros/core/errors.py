@@ -4,19 +4,38 @@ from __future__ import annotations
 
 
 class CurationError(Exception):
-    """Anything wrong with input, configuration or the outside world; the message is one line."""
+    """Anything wrong with input, configuration or the outside world; the message is one line.
+
+    Attributes:
+        finding: id in `findings.FINDINGS` of what is wrong with the input; empty where the input
+            is not to blame. A leaf's own stands where an error names none.
+    """
+
+    finding: str = ""
+
+    def __init__(self, *args: object, finding: str = "") -> None:
+        """Make an error of its message and, where one fits, the id of a finding."""
+        super().__init__(*args)
+        if finding:
+            self.finding = finding
 
 
 class ConfigError(CurationError):
     """A parameter, a topic map or a command line that does not make sense."""
 
+    finding = "bad-config"
+
 
 class EpisodeError(CurationError):
     """An episode that cannot be built, found or used."""
 
+    finding = "unusable"
+
 
 class BagError(CurationError):
     """A bag that cannot be read or written."""
+
+    finding = "unreadable"
 
 
 class NotFittedError(CurationError):

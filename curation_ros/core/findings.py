@@ -8,7 +8,32 @@ from typing import Literal
 Kind = Literal["recording", "motion", "task"]
 
 #: Every finding that there is: id -> (kind, what it means). The only list; docs are made from it.
+#: A recording fault says that the data are not what happened, odd motion that they are unusual,
+#: a failed task that they show no success; only the first kind keeps an episode from judgement.
 FINDINGS: dict[str, tuple[Kind, str]] = {
+    # The file: it could not be read, or not as an episode (`CurationError.finding`).
+    "ambiguous": ("recording", "more than one file, topic or definition would do"),
+    "bad-config": ("recording", "a topic map or parameter makes no sense for these data"),
+    "bad-definition": ("recording", "the definition of a message type cannot be read"),
+    "bad-metadata": ("recording", "what the recorder noted in the bag makes no sense"),
+    "checksum": ("recording", "a checksum is wrong: bytes have changed since the recording"),
+    "empty-file": ("recording", "the file has 0 bytes"),
+    "foreign-encoding": ("recording", "messages or schemas are in an encoding that is not ours"),
+    "foreign-format": ("recording", "the file is something else than MCAP, and known"),
+    "malformed": ("recording", "lengths or indexes in the file contradict its bytes"),
+    "missing-file": ("recording", "a file that should be there is not"),
+    "no-clock": ("recording", "the clock topic has no message: nothing says when it happened"),
+    "no-header": ("recording", "a type has no header although its stamp is to be read there"),
+    "no-topic-map": ("recording", "the bag has no topic map and none was given"),
+    "not-mcap": ("recording", "the file does not begin as MCAP does"),
+    "too-large": ("recording", "it claims more bytes than are ever read"),
+    "truncated": ("recording", "the file ends before its end"),
+    "unknown-channel": ("recording", "messages belong to a channel that nothing describes"),
+    "unreadable": ("recording", "the file cannot be opened or read"),
+    "unsupported-compression": ("recording", "compressed in a way that is not read"),
+    "unusable": ("recording", "no episode could be made of it"),
+    "wrong-type": ("recording", "a topic has another type than the topic map says"),
+    # The samples: seen by the builder, the owner of the episode or the recorder.
     "aborted": ("recording", "the owner of the episode gave it up"),
     "clock-back": ("recording", "stamps of a topic went back inside the episode"),
     "duplicate-stamp": ("recording", "two samples of one topic and stamp have different values"),
@@ -16,15 +41,27 @@ FINDINGS: dict[str, tuple[Kind, str]] = {
     "gripper-meaning": ("recording", "the fingers contradict the declared meaning of the gripper"),
     "incomplete": ("recording", "fewer samples than the owner of the episode counted"),
     "missing-topic": ("recording", "a mapped topic has no sample"),
+    "no-bag": ("recording", "the bag could not be read; the live episode stands"),
     "not-finite": ("recording", "a value is NaN or infinite"),
     "recovered": ("recording", "the bag was recovered after its recorder died"),
+    "undecodable": ("recording", "messages of a topic do not fit its declared type"),
     "unknown-loss": (
         "recording",
         "a topic has several publishers: lost messages cannot be counted",
     ),
     "unknown-phase": ("recording", "a phase name is not in the topic map"),
-    "undecodable": ("recording", "messages of a topic do not fit its declared type"),
-    "no-bag": ("recording", "the bag could not be read; the live episode stands"),
+    # The arrays: seen by `checks.check_episode`, and `duplicate` by who sees several episodes.
+    "clipped-start": ("recording", "it begins in mid-motion: its beginning was not recorded"),
+    "duplicate": ("recording", "another episode has the same values at the same times"),
+    "frozen": ("recording", "a measured topic repeats one value while the robot moves"),
+    "padded-tail": ("recording", "it ends with copies of one row, or with zeros"),
+    "rate": ("recording", "the clock is irregular, or not at the rate of the reference"),
+    "too-short": ("recording", "too few steps to be a demonstration"),
+    "idle": ("motion", "the robot rests for long and then goes on"),
+    "jump": ("motion", "the effector moves from one step to the next as no other step does"),
+    "never-grasped": ("task", "the gripper was never commanded to close"),
+    "opened-early": ("task", "the gripper opened before the task was at that point"),
+    "unfinished": ("task", "the last phase or the release was never reached"),
 }
 
 
