@@ -4,11 +4,13 @@ One walk over a message, driven by its definition, finds where every value lies.
 and irregular messages use it directly. For the rest the walk is done once: messages of the same
 length whose structural bytes (encapsulation, lengths, terminators, names that were looked up)
 equal those of a walked message have every value at the same place, so that NumPy can read the
-values of all of them as strided columns.
+values of all of them as strided columns. What such a walk has found is kept for the next block,
+and `shared_decoder` keeps it for the next bag.
 """
 
 from __future__ import annotations
 
+import copy
 import struct
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -26,8 +28,10 @@ from curation_ros.bags.definitions import (
 )
 from curation_ros.bags.schemas import message_schema
 from curation_ros.core.errors import ConfigError, EpisodeError
+from curation_ros.core.stream import Columns, Messages
 
 _HEADER_TYPE = "std_msgs/msg/Header"
+_TEXT_CODES = frozenset(TEXTS.values())
 _SIZES = {code: struct.calcsize(f"={code}") for code in PRIMITIVES.values()}
 #: Members that may name the elements of a list of numbers beside them.
 _NAME_LISTS = ("name", "joint_names")
@@ -246,35 +250,77 @@ class _Walk:
         )
 
 
+class _Run(NamedTuple):
+    """Numbers that lie side by side, for columns that stand side by side."""
+
+    code: str
+    at: int
+    column: int
+    n_columns: int
+
+
 class _Layout:
-    """What one walked message says about all that look alike."""
+    """What one walked message says about all that look alike.
+
+    Blocks of messages are (n, width) bytes, `width` the length rounded up to whole words.
+    """
 
     def __init__(self, walk: _Walk, leaves: Sequence[_Leaf]) -> None:
-        self.leaves = tuple(leaves)
         self.order = walk.order
-        mask = np.zeros(len(walk.data), dtype=bool)
+        length = len(walk.data)
+        mask = np.zeros(_width(length), dtype=np.uint8)
         for start, stop in walk.structure:
-            mask[start:stop] = True
-        self._where = np.flatnonzero(mask)
-        self._what = np.frombuffer(walk.data, np.uint8)[self._where]
+            mask[start:stop] = 0xFF
+        expected = np.zeros(_width(length), dtype=np.uint8)
+        expected[:length] = np.frombuffer(walk.data, np.uint8)
+        self._mask = mask.view(np.uint64)
+        self._expected = expected.view(np.uint64)
+        self.runs: list[_Run] = []
+        self.texts: list[tuple[int, _Leaf]] = []
+        for column, leaf in enumerate(leaves):
+            if leaf.code in _TEXT_CODES:
+                self.texts.append((column, leaf))
+                continue
+            last = self.runs[-1] if self.runs else _Run("", -1, -1, 0)
+            follows = (leaf.code, leaf.at, column) == (
+                last.code,
+                last.at + last.n_columns * _SIZES.get(last.code, 0),
+                last.column + last.n_columns,
+            )
+            if follows:
+                self.runs[-1] = last._replace(n_columns=last.n_columns + 1)
+            else:
+                self.runs.append(_Run(leaf.code, leaf.at, column, 1))
 
-    def alike(self, block: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
-        """(n,) which messages of a (n, length) block have this layout."""
-        same: npt.NDArray[np.bool_] = (block[:, self._where] == self._what).all(axis=1)
-        return same
+    def differing(self, block: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_] | None:
+        """(n,) which messages of a block have another layout; None: none has."""
+        wrong = (block.view(np.uint64) ^ self._expected) & self._mask
+        if not wrong.any():
+            return None
+        return np.asarray(wrong.any(axis=1))
 
-    def column(self, block: npt.NDArray[np.uint8], leaf: _Leaf) -> npt.NDArray[np.generic]:
-        """(n,) values at a leaf of a (n, length) block: float64, or bytes for a text."""
-        n, length = block.shape
-        code = {"s": f"S{max(leaf.length, 1)}", "?": "u1"}.get(leaf.code, self.order + leaf.code)
-        if leaf.code == "s" and not leaf.length:
-            return np.zeros(n, dtype="S1")
-        column: npt.NDArray[np.generic] = np.ndarray(
-            (n,), dtype=code, buffer=block, offset=leaf.at, strides=(length,)
+    def numbers(self, block: npt.NDArray[np.uint8], run: _Run) -> npt.NDArray[np.generic]:
+        """(n, n_columns) values of a run, of their own type, in a view of the block."""
+        code = "u1" if run.code == "?" else self.order + run.code
+        shape, strides = (len(block), run.n_columns), (block.shape[1], _SIZES[run.code])
+        values: npt.NDArray[np.generic] = np.ndarray(shape, code, block, run.at, strides)
+        return values != 0 if run.code == "?" else values
+
+    @staticmethod
+    def text(block: npt.NDArray[np.uint8], leaf: _Leaf) -> npt.NDArray[np.bytes_]:
+        """(n,) UTF-8 bytes at a leaf, in a view of the block."""
+        if not leaf.length:
+            return np.zeros(len(block), dtype="S1")
+        strides = (block.shape[1],)
+        texts: npt.NDArray[np.bytes_] = np.ndarray(
+            (len(block),), f"S{leaf.length}", block, leaf.at, strides
         )
-        if leaf.code == "s":
-            return column
-        return (column != 0).astype(np.float64) if leaf.code == "?" else column.astype(np.float64)
+        return texts
+
+
+def _width(length: int) -> int:
+    """Length of a message in whole words of 8 bytes."""
+    return -(-length // 8) * 8
 
 
 class CdrDecoder:
@@ -325,7 +371,7 @@ class CdrDecoder:
             EpisodeError: if the bytes do not fit the type.
             BagError: if the type has no definition here.
         """
-        walk, _ = self._walk(type_name)
+        walk = copy.copy(self._walk(type_name)[0])
         values: dict[str, Any] = walk.values(walk.run(data))
         return values
 
@@ -344,91 +390,53 @@ class CdrDecoder:
 
         Raises:
             EpisodeError: if a message does not fit the type, or lacks the element or name that a
-                path asks for.
+                path asks for; of several the first.
             ConfigError: if the type has no such path.
             BagError: if the type has no definition here.
         """
-        wanted = [self._path(type_name, path) for path in paths]
-        n = len(messages)
-        texts: dict[int, list[str]] = {k: [""] * n for k, p in enumerate(wanted) if p.is_text}
-        numbers = {k: np.empty(n) for k, p in enumerate(wanted) if not p.is_text}
-        by_length: dict[int, list[int]] = {}
-        for row, data in enumerate(messages):
-            by_length.setdefault(len(data), []).append(row)
-        for length, rows in by_length.items():
+        columns = self.decode_block(type_name, paths, Messages.joined(messages))
+        if columns.bad:
+            raise columns.bad[min(columns.bad)]
+        values = np.ascontiguousarray(columns.values.T)
+        return [columns.texts.get(k, values[k]) for k in range(len(paths))]
+
+    def decode_block(self, type_name: str, paths: Sequence[str], messages: Messages) -> Columns:
+        """Read the values at `paths` from every message, whatever is wrong with others.
+
+        Args:
+            type_name: type of all messages.
+            paths: as in FieldSpec.values. Integers beyond 2**53 lose digits.
+            messages: CDR bytes with their encapsulation.
+
+        Raises:
+            ConfigError: if the type has no such path.
+            BagError: if the type has no definition here.
+        """
+        job = _Job(self, type_name, [self._path(type_name, path) for path in paths], messages)
+        sizes = messages.sizes
+        if not len(messages):
+            return job.columns()
+        if (sizes == sizes[0]).all():
+            groups = [np.arange(len(sizes))]
+        else:
+            by_size = np.argsort(sizes, kind="stable")
+            groups = np.split(by_size, np.flatnonzero(np.diff(sizes[by_size])) + 1)
+        for rows in groups:
+            length = int(sizes[rows[0]])
             step = max(1, _BLOCK_BYTES // max(length, 1))
             for start in range(0, len(rows), step):
-                block = rows[start : start + step]
-                self._decode_block(type_name, wanted, messages, block, texts, numbers)
-        return [
-            np.array(texts[k], dtype=np.str_) if k in texts else numbers[k]
-            for k in range(len(wanted))
-        ]
+                job.decode(length, rows[start : start + step])
+        return job.columns()
 
-    def _decode_block(
-        self,
-        type_name: str,
-        paths: Sequence[_Path],
-        messages: Sequence[bytes],
-        rows: list[int],
-        texts: dict[int, list[str]],
-        numbers: dict[int, npt.NDArray[np.float64]],
-    ) -> None:
-        """Decode messages of equal length into `texts` and `numbers`."""
-        walk, _ = self._walk(type_name)
-        length = len(messages[rows[0]])
+    def start(
+        self, type_name: str, paths: Sequence[_Path], length: int
+    ) -> tuple[_Walk, list[_Layout]]:
+        """A general walk of a type, and the layouts that messages of a length have had so far."""
         if len(self._layouts) > _MAX_CACHED:
             self._layouts.clear()
-        layouts = self._layouts.setdefault((type_name, tuple(p.text for p in paths), length), [])
-        todo = np.array(rows)
-        joined = b"".join([messages[row] for row in rows])
-        data = np.frombuffer(joined, dtype=np.uint8).reshape(len(rows), length)
-        tried = 0
-        while len(todo):
-            if tried == len(layouts):
-                if tried == _MAX_LAYOUTS:
-                    break
-                tree = walk.run(messages[todo[0]])
-                layouts.append(_Layout(walk, [walk.find(tree, path) for path in paths]))
-            layout = layouts[tried]
-            tried += 1
-            alike = layout.alike(data)
-            if not alike.any():
-                continue
-            part, hit = (data, todo) if alike.all() else (data[alike], todo[alike])
-            for k, leaf in enumerate(layout.leaves):
-                if k in numbers:
-                    numbers[k][hit] = layout.column(part, leaf)
-                    continue
-                if leaf.code == "w":
-                    words = (self._read(walk, messages[row], [paths[k]])[0] for row in hit)
-                else:
-                    words = (
-                        self._utf8(type_name, word) for word in layout.column(part, leaf).tolist()
-                    )
-                for row, word in zip(hit, words, strict=True):
-                    texts[k][row] = word
-            todo, data = todo[~alike], data[~alike]
-        for row in todo:
-            for k, value in enumerate(self._read(walk, messages[row], paths)):
-                if k in numbers:
-                    numbers[k][row] = value
-                else:
-                    texts[k][row] = value
-
-    @staticmethod
-    def _read(walk: _Walk, data: bytes, paths: Sequence[_Path]) -> list[Any]:
-        tree = walk.run(data)
-        return [walk.value(walk.find(tree, path)) for path in paths]
-
-    @staticmethod
-    def _utf8(type_name: str, word: bytes) -> str:
-        try:
-            return word.decode()
-        except UnicodeDecodeError as err:
-            raise EpisodeError(
-                f"message of type {type_name} is malformed: {word!r:.60} is not UTF-8"
-            ) from err
+        key = (type_name, tuple([path.text for path in paths]), length)
+        # A copy: a walk remembers where it is, and threads may share a decoder.
+        return copy.copy(self._walk(type_name)[0]), self._layouts.setdefault(key, [])
 
     def _walk(self, type_name: str) -> tuple[_Walk, Definitions]:
         known = self._walks.get(type_name)
@@ -448,6 +456,145 @@ class CdrDecoder:
             known = _resolve_path(walk.type_name, definitions, path)
             self._paths[type_name, path] = known
         return known
+
+
+class _Job:
+    """One block of messages on its way to columns."""
+
+    def __init__(
+        self, decoder: CdrDecoder, type_name: str, paths: Sequence[_Path], messages: Messages
+    ) -> None:
+        self._decoder = decoder
+        self._type_name = type_name
+        self._paths = paths
+        self._messages = messages
+        self._values = np.empty((len(messages), len(paths)))
+        # Column -> rows and their texts, part by part.
+        self._texts: dict[int, list[tuple[npt.NDArray[np.int64], npt.NDArray[np.str_]]]] = {
+            k: [] for k, path in enumerate(paths) if path.is_text
+        }
+        self._bad: dict[int, EpisodeError] = {}
+
+    def columns(self) -> Columns:
+        return Columns(
+            self._values,
+            {k: self._column_of(parts) for k, parts in self._texts.items()},
+            self._bad,
+        )
+
+    def _column_of(
+        self, parts: Sequence[tuple[npt.NDArray[np.int64], npt.NDArray[np.str_]]]
+    ) -> npt.NDArray[np.str_]:
+        width = max((texts.dtype.itemsize // 4 for _, texts in parts), default=1)
+        column = np.zeros(len(self._messages), dtype=f"U{max(width, 1)}")
+        for rows, texts in parts:
+            column[rows] = texts
+        return column
+
+    def decode(self, length: int, rows: npt.NDArray[np.int64]) -> None:
+        """Read messages of one length: as blocks of known layouts, what is left one by one."""
+        walk, layouts = self._decoder.start(self._type_name, self._paths, length)
+        block = self._gather(rows, length)
+        for layout in tuple(layouts):
+            rows, block = self._read_alike(layout, block, rows)
+            if not len(rows):
+                return
+        learned: list[_Layout] = []
+        faults = 0
+        while len(rows) and max(len(learned), faults) < _MAX_LAYOUTS:
+            try:
+                tree = walk.run(self._messages[int(rows[0])])
+                layout = _Layout(walk, [walk.find(tree, path) for path in self._paths])
+            except EpisodeError as err:
+                self._bad[int(rows[0])] = err
+                rows, block = rows[1:], block[1:]
+                faults += 1
+                continue
+            learned.append(layout)
+            rows, block = self._read_alike(layout, block, rows)
+        layouts[:] = [*learned, *layouts][:_MAX_LAYOUTS]
+        for row in rows.tolist():
+            self._read_one(walk, row)
+
+    def _gather(self, rows: npt.NDArray[np.int64], length: int) -> npt.NDArray[np.uint8]:
+        """(n, width) bytes of messages of one length."""
+        width = _width(length)
+        if not width:
+            return np.empty((len(rows), 0), dtype=np.uint8)
+        buffer, starts = self._messages.buffer, self._messages.starts[rows]
+        if int(starts.max()) + width > len(buffer):
+            buffer = np.concatenate([buffer, np.zeros(width - length, dtype=np.uint8)])
+        # A view with a message at every byte: picking from it copies only those wanted.
+        places = np.ndarray((len(buffer) - width + 1,), f"V{width}", buffer, 0, (1,))
+        block: npt.NDArray[np.uint8] = places[starts].view(np.uint8).reshape(len(rows), width)
+        return block
+
+    def _read_alike(
+        self, layout: _Layout, block: npt.NDArray[np.uint8], rows: npt.NDArray[np.int64]
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint8]]:
+        """Read those messages of a block that have a layout, and return the others."""
+        differing = layout.differing(block)
+        if differing is None:
+            self._read_block(layout, block, rows)
+            return rows[:0], block[:0]
+        alike = ~differing
+        if alike.any():
+            self._read_block(layout, block[alike], rows[alike])
+            rows, block = rows[differing], block[differing]
+        return rows, block
+
+    def _read_block(
+        self, layout: _Layout, block: npt.NDArray[np.uint8], rows: npt.NDArray[np.int64]
+    ) -> None:
+        whole = len(rows) == len(self._messages)
+        for run in layout.runs:
+            values = layout.numbers(block, run)
+            columns = slice(run.column, run.column + run.n_columns)
+            if whole:
+                self._values[:, columns] = values
+            else:
+                self._values[rows, columns] = values
+        for column, leaf in layout.texts:
+            if leaf.code == "w":
+                walk, _ = self._decoder.start(self._type_name, self._paths, 0)
+                for row in rows.tolist():
+                    self._read_one(walk, row)
+                return
+            self._texts[column].append((rows, self._unicode(layout.text(block, leaf), rows)))
+
+    def _unicode(
+        self, raw: npt.NDArray[np.bytes_], rows: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.str_]:
+        try:
+            return raw.astype(np.str_)
+        except UnicodeDecodeError:
+            pass  # not ASCII
+        out = []
+        for row, word in zip(rows.tolist(), raw.tolist(), strict=True):
+            try:
+                out.append(word.decode())
+            except UnicodeDecodeError:
+                out.append("")
+                self._bad.setdefault(
+                    row,
+                    EpisodeError(
+                        f"message of type {self._type_name} is malformed: {word!r:.60} is not UTF-8"
+                    ),
+                )
+        return np.array(out, dtype=np.str_)
+
+    def _read_one(self, walk: _Walk, row: int) -> None:
+        try:
+            tree = walk.run(self._messages[row])
+            values = [walk.value(walk.find(tree, path)) for path in self._paths]
+        except EpisodeError as err:
+            self._bad[row] = err
+            return
+        for column, value in enumerate(values):
+            if column in self._texts:
+                self._texts[column].append((np.array([row]), np.array([value], dtype=np.str_)))
+            else:
+                self._values[row, column] = value
 
 
 def _least_sizes(definitions: Definitions) -> dict[str, int]:

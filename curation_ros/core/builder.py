@@ -11,7 +11,15 @@ import numpy.typing as npt
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import EpisodeError
 from curation_ros.core.findings import Finding
-from curation_ros.core.stream import NS_PER_S, Decoder, Floats, Sample, Stamps
+from curation_ros.core.stream import (
+    NS_PER_S,
+    Decoder,
+    Floats,
+    Messages,
+    Sample,
+    SampleBlock,
+    Stamps,
+)
 from curation_ros.core.topic_map import FieldSpec, TopicMap
 
 # Decoding many messages in one pass is far cheaper than one by one; doing it while the episode
@@ -30,8 +38,8 @@ class _Track:
         self.labels = {s.values[0]: s.labels for s in specs if s.labels}
         self._decoder = decoder
         self._pending: list[Sample] = []
-        self._stamps: list[int] = []
-        self._seqs: list[int] = []
+        self._stamps: list[Stamps] = []
+        self._seqs: list[Stamps] = []
         self._columns: list[Floats] = []
         self.bad: list[tuple[int, str]] = []
         self.unknown: dict[str, int] = {}
@@ -41,62 +49,66 @@ class _Track:
         if len(self._pending) >= _BATCH:
             self._decode_pending()
 
+    def push_block(self, block: SampleBlock) -> None:
+        self._decode_pending()
+        self._decode(block.stamps_ns, block.seqs, block.messages)
+
     def _decode_pending(self) -> None:
         batch, self._pending = self._pending, []
-        if not batch:
-            return
-        try:
-            rows = self._decode([s.data for s in batch], batch)
-        except EpisodeError:
-            # One bad message must not cost its neighbours.
-            good = []
-            kept = []
-            for sample in batch:
-                try:
-                    good.append(self._decode([sample.data], [sample]))
-                    kept.append(sample)
-                except EpisodeError as err:
-                    self.bad.append((sample.stamp_ns, str(err)))
-            if not good:
-                return
-            rows, batch = np.concatenate(good), kept
-        self._columns.append(rows)
-        self._stamps.extend(s.stamp_ns for s in batch)
-        self._seqs.extend(s.seq for s in batch)
+        if batch:
+            self._decode(
+                np.array([s.stamp_ns for s in batch], dtype=np.int64),
+                np.array([s.seq for s in batch], dtype=np.int64),
+                Messages.joined([s.data for s in batch]),
+            )
 
-    def _decode(self, messages: list[bytes], batch: Sequence[Sample]) -> Floats:
-        """(n, len(paths)) values; labels become indices, text becomes numbers."""
-        columns = self._decoder.decode(self.type, self.paths, messages)
-        out = np.empty((len(messages), len(self.paths)))
-        for k, (path, column) in enumerate(zip(self.paths, columns, strict=True)):
+    def _decode(self, stamps: Stamps, seqs: Stamps, messages: Messages) -> None:
+        """Keep (n, len(paths)) values; labels become indices, text becomes numbers."""
+        values, texts, bad = self._decoder.decode_block(self.type, self.paths, messages)
+        if bad:
+            # One bad message must not cost its neighbours.
+            rows = sorted(bad)
+            self.bad += [(int(stamps[row]), str(bad[row])) for row in rows]
+            good = np.ones(len(stamps), dtype=bool)
+            good[rows] = False
+            stamps, seqs, values = stamps[good], seqs[good], values[good]
+            texts = {k: column[good] for k, column in texts.items()}
+        for k, path in enumerate(self.paths):
             if path in self.labels:
-                out[:, k] = self._indices(column, self.labels[path], batch)
-            elif column.dtype.kind == "U":
-                out[:, k] = [_number(text) for text in column]
-            else:
-                out[:, k] = column
-        return out
+                column = texts[k] if k in texts else np.array([str(x) for x in values[:, k]], "U")
+                values[:, k] = self._indices(column, self.labels[path], stamps)
+            elif k in texts:
+                values[:, k] = [_number(text) for text in texts[k]]
+        self._columns.append(values)
+        self._stamps.append(stamps)
+        self._seqs.append(seqs)
 
     def _indices(
-        self, column: npt.NDArray[np.generic], labels: Sequence[str], batch: Sequence[Sample]
+        self, column: npt.NDArray[np.str_], labels: Sequence[str], stamps: Stamps
     ) -> Floats:
-        index = {label: float(i) for i, label in enumerate(labels)}
-        values = np.array([index.get(str(text), -1.0) for text in column])
-        for text, value, sample in zip(column, values, batch, strict=True):
-            if value < 0:
-                first_ns = self.unknown.get(str(text), sample.stamp_ns)
-                self.unknown[str(text)] = min(first_ns, sample.stamp_ns)
+        values = np.full(len(column), -1.0)
+        for index, label in enumerate(labels):
+            values[column == label] = index
+        for row in np.flatnonzero(values < 0):
+            text, stamp_ns = str(column[row]), int(stamps[row])
+            self.unknown[text] = min(self.unknown.get(text, stamp_ns), stamp_ns)
         return values
 
     def ordered(self, start_ns: int, end_ns: int) -> _Ordered:
         """Samples inside the window by (stamp, seq, arrival), one a stamp."""
         self._decode_pending()
-        stamps = np.array(self._stamps, dtype=np.int64)
+        none = np.empty(0, dtype=np.int64)
+        stamps = np.concatenate([*self._stamps, none])
+        values = np.concatenate([*self._columns, np.empty((0, len(self.paths)))])
+        steps = np.diff(stamps)
+        if not len(stamps) or (steps > 0).all():
+            # They came in order, each stamp once: nothing to sort, nothing to choose from.
+            low = int(np.searchsorted(stamps, start_ns))
+            high = int(np.searchsorted(stamps, end_ns, side="right"))
+            return _Ordered(stamps[low:high], values[low:high], conflict_ns=none, back_ns=none)
         inside = (stamps >= start_ns) & (stamps <= end_ns)
-        stamps = stamps[inside]
-        width = len(self.paths)
-        values = np.concatenate([*self._columns, np.empty((0, width))])[inside]
-        seqs = np.array(self._seqs, dtype=np.int64)[inside]
+        stamps, values = stamps[inside], values[inside]
+        seqs = np.concatenate([*self._seqs, none])[inside]
         # lexsort is stable: what is equal in both keys stays in arrival order.
         order = np.lexsort((seqs, stamps))
         first = np.ones(len(order), dtype=bool)
@@ -166,13 +178,34 @@ class EpisodeBuilder:
         Raises:
             EpisodeError: if the topic is not in the map (labels and outcomes have no way in).
         """
-        track = self._tracks.get(sample.topic)
-        if track is None:
-            raise EpisodeError(
-                f"episode {self.episode_id}: topic {sample.topic!r} is not in the topic map"
-            )
+        track = self._track(sample.topic)
         if sample.stamp_ns >= self.start_ns:
             track.push(sample)
+
+    def push_block(self, block: SampleBlock) -> None:
+        """Take many samples of one topic; the episode is the same as if they came one by one.
+
+        Raises:
+            EpisodeError: if the topic is not in the map.
+        """
+        track = self._track(block.topic)
+        wanted = block.stamps_ns >= self.start_ns
+        if not wanted.all():
+            block = SampleBlock(
+                block.topic,
+                block.stamps_ns[wanted],
+                block.seqs[wanted],
+                block.messages.take(wanted),
+            )
+        track.push_block(block)
+
+    def _track(self, topic: str) -> _Track:
+        track = self._tracks.get(topic)
+        if track is None:
+            raise EpisodeError(
+                f"episode {self.episode_id}: topic {topic!r} is not in the topic map"
+            )
+        return track
 
     def partial(self) -> Episode:
         """The episode up to the newest stamp of its clock."""
@@ -227,8 +260,10 @@ class EpisodeBuilder:
         """(T, D) values of a field on the clock, NaN where there are none, and which rows are."""
         track = self._tracks[spec.topic]
         columns = [track.paths.index(path) for path in spec.values]
-        values = np.full((len(clock), len(columns)), np.nan)
         stamps = ordered.stamps
+        if np.array_equal(stamps, clock) and not spec.interpolate:
+            return np.take(ordered.values, columns, axis=1), np.ones(len(clock), dtype=bool)
+        values = np.full((len(clock), len(columns)), np.nan)
         if not len(stamps):
             return values, np.zeros(len(clock), dtype=bool)
         if spec.topic in self.topic_map.command_topics:
@@ -276,8 +311,9 @@ class EpisodeBuilder:
         if len(ordered.back_ns):
             message = f"topic {topic!r}: stamps went back {len(ordered.back_ns)} times"
             found.append(Finding("clock-back", message, at(int(ordered.back_ns[0]))))
-        bad_rows = np.flatnonzero(~np.isfinite(ordered.values).all(axis=1))
-        if len(bad_rows):
+        finite = np.isfinite(ordered.values)
+        if not finite.all():
+            bad_rows = np.flatnonzero(~finite.all(axis=1))
             message = f"topic {topic!r}: {len(bad_rows)} samples with NaN or infinite values"
             found.append(Finding("not-finite", message, at(int(stamps[bad_rows[0]]))))
         unknown = {k: v for k, v in track.unknown.items() if self.start_ns <= v <= end_ns}
@@ -287,8 +323,8 @@ class EpisodeBuilder:
         edges = np.concatenate([[self.start_ns], stamps, [end_ns]])
         silent = np.diff(edges)
         limit = int(self.topic_map.max_gap_s * NS_PER_S)
-        gaps = np.flatnonzero(silent > limit)
-        if len(gaps):
+        if (silent > limit).any():
+            gaps = np.flatnonzero(silent > limit)
             worst = int(gaps[np.argmax(silent[gaps])])
             begin, stop = int(edges[worst]) - self.start_ns, int(edges[worst + 1]) - self.start_ns
             message = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -15,6 +16,16 @@ Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
 
 NS_PER_S = 1_000_000_000
+
+#: How a message begins whose type begins with std_msgs/Header; integers little-endian.
+_STAMPED = np.dtype(
+    {
+        "names": ["encoding", "sec", "nanosec"],
+        "formats": ["u1", "<i4", "<u4"],
+        "offsets": [1, 4, 8],
+        "itemsize": 12,
+    }
+)
 
 
 class Sample(NamedTuple):
@@ -33,6 +44,63 @@ class Sample(NamedTuple):
     publish_ns: int = 0
 
 
+@dataclass(frozen=True, eq=False)
+class Messages:
+    """CDR bytes of messages of one topic in one buffer: as a chunk of a bag holds them.
+
+    Attributes:
+        buffer: (N,) contiguous uint8.
+        starts, sizes: (n,) int64; message k is buffer[starts[k] : starts[k] + sizes[k]].
+    """
+
+    buffer: npt.NDArray[np.uint8]
+    starts: Stamps
+    sizes: Stamps
+
+    def __len__(self) -> int:
+        """Number of messages n."""
+        return len(self.starts)
+
+    def __getitem__(self, row: int) -> bytes:
+        """The bytes of one message."""
+        start = int(self.starts[row])
+        return self.buffer[start : start + int(self.sizes[row])].tobytes()
+
+    def take(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> Messages:
+        """Some of the messages, in the same buffer."""
+        return Messages(self.buffer, self.starts[rows], self.sizes[rows])
+
+    @classmethod
+    def joined(cls, messages: Sequence[bytes]) -> Messages:
+        """Single messages side by side."""
+        sizes = np.array([len(data) for data in messages], dtype=np.int64)
+        buffer = np.frombuffer(b"".join(messages), dtype=np.uint8)
+        return cls(buffer, np.cumsum(sizes) - sizes, sizes)
+
+
+class SampleBlock(NamedTuple):
+    """Samples of one topic in their order; each array has a value a message, as Sample names it."""
+
+    topic: str
+    stamps_ns: Stamps
+    seqs: Stamps
+    messages: Messages
+
+
+class Columns(NamedTuple):
+    """Values that a decoder has read from n messages at k paths.
+
+    Attributes:
+        values: (n, k) numbers; what stands in a column of texts or a bad row has no meaning.
+        texts: column -> (n,) unicode array, where a path leads to a text.
+        bad: row -> why its message could not be read.
+    """
+
+    values: Floats
+    texts: dict[int, npt.NDArray[np.str_]]
+    bad: dict[int, EpisodeError]
+
+
 class Decoder(Protocol):
     """Turns CDR bytes of one message type into columns; `curation_ros.bags.cdr` has the real one.
 
@@ -43,18 +111,11 @@ class Decoder(Protocol):
         """Whether the type begins with a std_msgs/Header."""
         ...
 
-    def decode(
-        self, type_name: str, paths: Sequence[str], messages: Sequence[bytes]
-    ) -> list[npt.NDArray[np.generic]]:
-        """Read the values at `paths` from every message.
+    def decode_block(self, type_name: str, paths: Sequence[str], messages: Messages) -> Columns:
+        """Read the values at `paths` from every message; a message that does not fit is bad.
 
-        Returns:
-            One array of shape (len(messages),) a path: float64 for numbers and booleans, a
-            unicode array for strings.
-
-        Raises:
-            EpisodeError: if a message is shorter than its type says, or a path or the name of a
-                joint is not in it; the message names type and path.
+        Numbers and booleans become float64. A message is bad if it is shorter than its type says,
+        or if the element or the name of a joint that a path asks for is not in it.
         """
         ...
 
@@ -70,6 +131,30 @@ def header_stamp_ns(data: bytes) -> int:
     # The encapsulation's second byte is odd for little-endian encodings (OMG DDSI-RTPS, 10.5).
     sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return int(sec) * NS_PER_S + int(nanosec)
+
+
+def header_stamps_ns(messages: Messages) -> Stamps:
+    """(n,) stamps as `header_stamp_ns` reads them, of all messages in one pass.
+
+    Raises:
+        EpisodeError: if a message is too short to hold a header.
+    """
+    short = np.flatnonzero(messages.sizes < _STAMPED.itemsize)
+    if len(short):
+        header_stamp_ns(messages[int(short[0])])
+    if not len(messages):
+        return np.empty(0, dtype=np.int64)
+    # A view of the buffer with a head at every byte: picking from it copies only those wanted.
+    n_places = len(messages.buffer) - _STAMPED.itemsize + 1
+    places = np.ndarray((n_places,), _STAMPED, buffer=messages.buffer, strides=(1,))
+    heads = places[messages.starts]
+    sec, nanosec = heads["sec"], heads["nanosec"]
+    big = heads["encoding"] & 1 == 0
+    if big.any():
+        sec = np.where(big, sec.byteswap(), sec)
+        nanosec = np.where(big, nanosec.byteswap(), nanosec)
+    stamps: Stamps = sec.astype(np.int64) * NS_PER_S + nanosec.astype(np.int64)
+    return stamps
 
 
 def playback_order(samples: Sequence[Sample]) -> list[Sample]:
