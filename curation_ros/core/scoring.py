@@ -6,17 +6,22 @@ import hashlib
 import math
 import struct
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from curation_ros.core.decisions import CURATOR, RULES, Decision, Rule, decide, untrustworthy
+from curation_ros.core.decisions import CURATOR, Decision, decide, untrustworthy
 from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
+from curation_ros.core.examination import Examination, Part
+from curation_ros.core.findings import Finding
 from curation_ros.core.gripper import gripper_findings
 from curation_ros.core.length_control import LengthControl
-from curation_ros.core.scorers import SCORERS, Scorer
+from curation_ros.core.rules import RULES, Rule
+from curation_ros.core.salvage import sound_part
+from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, PoolScorer, Scorer
 from curation_ros.core.scorers.features import phase_name
+from curation_ros.core.selection import TieKey
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -24,32 +29,54 @@ if TYPE_CHECKING:
     from curation_ros.core.episode import Episode
 
 NO_REFERENCE = "no reference"
-#: Raised when the meaning of the state hash changes.
-_STATE_VERSION = 1
+NO_DATASET = "it compares with the whole dataset, which was not given"
+#: Raised when the meaning of the state hash, or what an examination finds, changes.
+_STATE_VERSION = 2
 #: References are scored by scorers that were fitted without them; above this many, in groups.
 _MAX_FOLDS = 20
+
+
+@dataclass(frozen=True)
+class Ruling:
+    """A fitted rule, and what it has seen.
+
+    Attributes:
+        rule: None where it could not be fitted.
+        no_rule: why not.
+        basis: `provisional` where the dataset that it was fitted on may still grow.
+        fitted_on: what it has seen: `what` (nothing, reference, dataset), number of `episodes`,
+            and a `hash` over their ids and scores.
+        state_hash: of scorers and rule with all that they have learned.
+    """
+
+    rule: Rule | None
+    no_rule: str
+    basis: Literal["final", "provisional"]
+    fitted_on: Mapping[str, Any] = field(default_factory=dict)
+    state_hash: str = ""
 
 
 class Curation:
     """The curator without its node: an episode goes in, scores and a decision come out.
 
-    Invariant: after `fit`, scores and decisions are functions of the episode and of a fitted
-    state whose hash is `state_hash`; neither the order of the reference nor the number of
-    episodes that are scored changes them.
+    Invariant: after `fit` (and `fit_dataset`, where something needs that), scores are functions
+    of the episode and of a fitted state whose hash is `scoring_hash`, and decisions of that and
+    of a `Ruling`, with its `state_hash`; neither the order of the reference or the dataset nor
+    the number of episodes that are scored changes them.
 
     Attributes:
         scorers_: name -> fitted scorer, in the order asked for.
         unfitted_: name -> why a scorer could not be fitted; it abstains with that.
         length_: fitted length control; without a reference a mode that needs one becomes 'none'.
-        rule_: fitted rule, None where it could not be fitted.
-        no_rule_: why not.
+        ruling_: the rule, as far as it can be fitted without the dataset.
         reference_ids_: sorted ids of the reference episodes.
+        dataset_ids_: sorted ids of the dataset's episodes, where `fit_dataset` has seen them.
     """
 
     def __init__(
         self,
         *,
-        scorers: Sequence[str] = tuple(SCORERS),
+        scorers: Sequence[str] = DEFAULT_SCORERS,
         rule: str = "threshold",
         rule_scorer: str = "gripper_timing",
         length: str = "shortest-reference",
@@ -134,8 +161,10 @@ class Curation:
                 deciding scorer cannot score, and why.
         """
         episodes = sorted(reference, key=lambda e: e.id)
-        vars(self).pop("state_hash_", None)  # a fit that fails leaves nothing to score with
+        vars(self).pop("scoring_hash_", None)  # a fit that fails leaves nothing to score with
         _check_reference(episodes)
+        self.reference_ids_ = tuple(e.id for e in episodes)
+        self.dataset_ids_: tuple[str, ...] = ()
         self.length_ = LengthControl(self.length, self.length_value)
         if self.length_.needs_reference and not episodes:
             self.length_ = LengthControl("none")
@@ -145,6 +174,9 @@ class Curation:
         for name in self.scorers:
             scorer = self._make_scorer(name)
             self.scorers_[name] = scorer
+            if scorer.needs == "dataset":
+                self.unfitted_[name] = NO_DATASET
+                continue
             if scorer.needs == "reference" and not episodes:
                 self.unfitted_[name] = NO_REFERENCE
                 continue
@@ -152,9 +184,54 @@ class Curation:
                 scorer.fit(self._views(scorer, episodes))
             except EpisodeError as err:
                 self.unfitted_[name] = str(err)
-        self._fit_rule(episodes)
-        self.reference_ids_ = tuple(e.id for e in episodes)
-        self.state_hash_ = self._hash()
+        rule, no_rule, seen = self._reference_rule(episodes)
+        self.scoring_hash_ = self._hash_scoring()
+        self.ruling_ = self._ruling(rule, no_rule, "final", seen)
+        return self
+
+    @property
+    def needs_dataset(self) -> bool:
+        """Whether `fit_dataset` is to be called before scoring, so that nobody abstains."""
+        by_length = self.length == "percentile" and self.length_.mode == "none"
+        return by_length or any(s.needs == "dataset" for s in self.scorers_.values())
+
+    def fit_dataset(self, episodes: Iterable[Episode]) -> Self:
+        """Let scorers that need it learn from the dataset that is to be scored, without labels.
+
+        Args:
+            episodes: all of them, in any order; may be a stream that is read again each time it
+                is iterated: one episode is held at a time. Iterated twice where the length
+                control learns from their lengths, else once.
+
+        Raises:
+            NotFittedError: before `fit`.
+        """
+        self._check_fitted()
+        if self.length == "percentile" and self.length_.mode == "none":
+            lengths = [len(e) for e in episodes]
+            self.length_ = LengthControl(self.length, self.length_value).fit_lengths(lengths)
+        pools = {k: s for k, s in self.scorers_.items() if isinstance(s, PoolScorer)}
+        rows: dict[str, dict[str, Any]] = {name: {} for name in pools}
+        ids = set()
+        for episode in episodes:
+            ids.add(episode.id)
+            for name, scorer in pools.items():
+                try:
+                    [view] = self._views(scorer, [episode])
+                    rows[name][episode.id] = scorer.summary(view)
+                except EpisodeError:  # it will abstain when it is asked to score that one, too
+                    continue
+        for name, scorer in pools.items():
+            self.unfitted_.pop(name, None)
+            try:
+                found = sorted(rows[name])
+                scorer.fit_summaries(found, [rows[name][i] for i in found])
+            except EpisodeError as err:
+                self.unfitted_[name] = str(err)
+        self.dataset_ids_ = tuple(sorted(ids))
+        self.scoring_hash_ = self._hash_scoring()
+        old = self.ruling_
+        self.ruling_ = self._ruling(old.rule, old.no_rule, "final", dict(old.fitted_on))
         return self
 
     def _views(self, scorer: Scorer, episodes: Sequence[Episode]) -> list[Episode]:
@@ -163,33 +240,88 @@ class Curation:
             return list(episodes)
         return [self.length_.apply(e) for e in episodes]
 
-    def _fit_rule(self, episodes: Sequence[Episode]) -> None:
+    def _reference_rule(
+        self, episodes: Sequence[Episode]
+    ) -> tuple[Rule | None, str, dict[str, Any]]:
+        """The rule as far as the reference fits it, else why there is none; what it has seen."""
         rule = self._make_rule()
-        self.rule_: Rule | None = None
-        self.no_rule_ = ""
         scorer = self.scorers_[self.rule_scorer]
         if rule.needs == "nothing":
-            self.rule_ = rule.fit([])
-        elif not episodes:
-            self.no_rule_ = NO_REFERENCE
-        elif len(episodes) < rule.min_references:
-            self.no_rule_ = (
+            return rule.fit([]), "", {"what": "nothing"}
+        if rule.needs == "dataset":
+            return None, "no other episode is scored yet", {"what": "dataset", "episodes": 0}
+        if not episodes:
+            return None, NO_REFERENCE, {"what": "reference", "episodes": 0}
+        if len(episodes) < rule.min_references:
+            why = (
                 f"the rule needs {rule.min_references} reference episodes, "
                 f"there are {len(episodes)}"
             )
-        elif self.rule_scorer in self.unfitted_:
-            self.no_rule_ = f"{self.rule_scorer}: {self.unfitted_[self.rule_scorer]}"
-        else:
-            scores = self._reference_scores(self.rule_scorer, episodes)
-            self.rule_ = rule.fit(scores, resolution=scorer.resolution)
+            return None, why, {"what": "reference", "episodes": len(episodes)}
+        if self.rule_scorer in self.unfitted_:
+            why = f"{self.rule_scorer}: {self.unfitted_[self.rule_scorer]}"
+            return None, why, {"what": "reference", "episodes": len(episodes)}
+        scores = self._reference_scores(self.rule_scorer, episodes)
+        rule.fit(list(scores.values()), resolution=scorer.resolution)
+        return rule, "", _seen("reference", scores)
 
-    def _reference_scores(self, name: str, episodes: Sequence[Episode]) -> list[float]:
-        """Scores of the reference, each by a scorer that was fitted without that episode."""
+    def ruling(
+        self, scores: Mapping[str, float | None], *, final: bool, tie: TieKey | None = None
+    ) -> Ruling:
+        """The rule, fitted on the dataset where it needs that.
+
+        Args:
+            scores: episode id -> the deciding scorer's score of every episode of the dataset, or
+                of those seen so far; None where it abstained.
+            final: whether these are all there will be.
+            tie: see `Rule.fit_dataset`.
+
+        Returns:
+            `ruling_` where the rule does not look at the dataset.
+
+        Raises:
+            NotFittedError: before `fit`.
+        """
+        self._check_fitted()
+        rule = self._make_rule()
+        if rule.needs != "dataset":
+            return self.ruling_
+        known = {k: v for k, v in scores.items() if v is not None}
+        basis: Literal["final", "provisional"] = "final" if final else "provisional"
+        seen = _seen("dataset", known)
+        resolution = self.scorers_[self.rule_scorer].resolution
+        try:
+            rule.fit_dataset(known, resolution=resolution, tie=tie)
+        except EpisodeError as err:
+            return self._ruling(None, str(err), basis, seen)
+        return self._ruling(rule, "", basis, seen)
+
+    def _ruling(
+        self,
+        rule: Rule | None,
+        no_rule: str,
+        basis: Literal["final", "provisional"],
+        seen: Mapping[str, Any],
+    ) -> Ruling:
+        digest = hashlib.sha256()
+        state = {
+            "scoring": self.scoring_hash_,
+            "name": self.rule,
+            "scorer": self.rule_scorer,
+            "params": self.rule_params,
+            "fitted": rule.fitted() if rule is not None else no_rule,
+            "seen": dict(seen),
+        }
+        _feed(digest, state)
+        return Ruling(rule, no_rule, basis, dict(seen), digest.hexdigest())
+
+    def _reference_scores(self, name: str, episodes: Sequence[Episode]) -> dict[str, float]:
+        """Id -> score of the reference, each by a scorer that was fitted without that episode."""
         fitted = self.scorers_[name]
         views = self._views(fitted, episodes)
         n_folds = min(len(views), _MAX_FOLDS) if fitted.needs == "reference" else 1
         shuffled = sorted(views, key=lambda e: hashlib.sha256(e.id.encode()).digest())
-        scores = []
+        scores = {}
         for fold in range(n_folds):
             held_out = shuffled[fold::n_folds]
             scorer = fitted
@@ -198,7 +330,7 @@ class Curation:
                 scorer = self._make_scorer(name).fit([e for e in views if e.id not in ids])
             for episode in held_out:
                 try:
-                    scores.append(scorer.score(episode))
+                    scores[episode.id] = scorer.score(episode)
                 except EpisodeError as err:
                     raise EpisodeError(
                         f"reference episode {episode.name} ({episode.id}): "
@@ -207,7 +339,7 @@ class Curation:
         return scores
 
     def _check_fitted(self) -> None:
-        if not hasattr(self, "state_hash_"):
+        if not hasattr(self, "scoring_hash_"):
             raise NotFittedError("Curation: call fit first; the reference may be empty")
 
     def score(self, episode: Episode) -> tuple[dict[str, float | None], dict[str, str]]:
@@ -220,16 +352,17 @@ class Curation:
             NotFittedError: before `fit`.
         """
         self._check_fitted()
+        view, no_view = self._view(episode)
         scores: dict[str, float | None] = {}
         abstained: dict[str, str] = {}
-        view = self.length_.apply(episode)
         for name, scorer in self.scorers_.items():
             scores[name] = None
-            if name in self.unfitted_:
-                abstained[name] = self.unfitted_[name]
+            shown = view if scorer.length_controlled else episode
+            if name in self.unfitted_ or shown is None:
+                abstained[name] = self.unfitted_.get(name, no_view)
                 continue
             try:
-                score = float(scorer.score(view if scorer.length_controlled else episode))
+                score = float(scorer.score(shown))
             except EpisodeError as err:  # Abstain is one
                 abstained[name] = str(err)
                 continue
@@ -239,23 +372,64 @@ class Curation:
                 abstained[name] = f"its score is {score}"
         return scores, abstained
 
-    def decide(self, episode: Episode, revision: int = 1, by: str = CURATOR) -> Decision:
-        """Score one episode and decide on it.
+    def _view(self, episode: Episode) -> tuple[Episode | None, str]:
+        """The episode under length control, or why there is none."""
+        try:
+            return self.length_.apply(episode), ""
+        except EpisodeError as err:
+            return None, str(err)
+
+    def examine(self, episode: Episode) -> Examination:
+        """Score one episode and look at it; what a rule judges by.
 
         Raises:
             NotFittedError: before `fit`.
         """
+        findings = self._findings(episode)
+        scores, abstained, words, seen = self._look(episode)
+        part = None
+        kept = sound_part(episode, untrustworthy(findings))
+        if kept is not None:
+            rest = episode.steps(kept[1] + 1, kept[0])
+            less = untrustworthy(self._findings(rest))
+            if all(f.id in {g.id for g in findings} for f in less):
+                some, silent, said, _ = self._look(rest)
+                cut = untrustworthy(findings)[0]
+                part = Part(episode.span(*kept), f"{cut.id}: {cut.message}", some, silent, said)
+        evidence: dict[str, Any] = {"length_steps": self.length_.steps_}
+        if seen:
+            evidence["seen"] = seen
+        return Examination(
+            episode=episode.id,
+            name=episode.name,
+            steps=len(episode),
+            span=(0, max(0, episode.end_ns - episode.start_ns)),
+            scores=scores,
+            abstained=abstained,
+            words=words,
+            findings=findings,
+            evidence=evidence,
+            content=episode.content_digest,
+            part=part,
+        )
+
+    def _findings(self, episode: Episode) -> tuple[Finding, ...]:
+        if any(f.id == "gripper-meaning" for f in episode.findings):
+            return episode.findings
+        return episode.findings + gripper_findings(episode)
+
+    def _look(
+        self, episode: Episode
+    ) -> tuple[dict[str, float | None], dict[str, str], dict[str, str], dict[str, Any]]:
+        """Scores, why some are missing, what scorers say, and where they look."""
         scores, abstained = self.score(episode)
-        if not any(f.id == "gripper-meaning" for f in episode.findings):
-            episode = replace(episode, findings=episode.findings + gripper_findings(episode))
         words: dict[str, str] = {}
         seen: dict[str, dict[str, Any]] = {}
-        view = self.length_.apply(episode)
-        for name in self.scorers_:
-            if name in abstained:
-                continue
-            scorer = self.scorers_[name]
+        view, _ = self._view(episode)
+        for name, scorer in self.scorers_.items():
             shown = view if scorer.length_controlled else episode
+            if name in abstained or shown is None:
+                continue
             text, steps = scorer.explain(shown), scorer.location(shown)
             if text is not None:
                 words[name] = text
@@ -264,38 +438,72 @@ class Curation:
                     "span": list(shown.span(*steps)),
                     "phase": phase_name(shown, steps[0]),
                 }
-        evidence: dict[str, Any] = {"length_steps": self.length_.steps_}
-        if seen:
-            evidence["seen"] = seen
-        if self.rule_ is not None and self.rule_.params().get("threshold") is not None:
-            evidence["threshold"] = float(self.rule_.params()["threshold"])
-        elif self.rule_ is not None and "threshold_" in self.rule_.fitted():
-            evidence["threshold"] = float(self.rule_.fitted()["threshold_"])
+        return scores, abstained, words, seen
+
+    def judge(
+        self,
+        seen: Examination,
+        ruling: Ruling | None = None,
+        *,
+        revision: int = 1,
+        by: str = CURATOR,
+    ) -> Decision:
+        """Decide on an episode that was examined.
+
+        Args:
+            seen: by this curation.
+            ruling: of this curation; None: what `fit` made, without a look at the dataset.
+            revision: number of the decision.
+            by: author.
+        """
+        ruling = self.ruling_ if ruling is None else ruling
+        evidence: dict[str, Any] = {
+            "basis": ruling.basis,
+            "fitted_on": dict(ruling.fitted_on),
+            "scoring": self.scoring_hash_,
+            "content": seen.content,
+        }
+        if ruling.rule is not None and ruling.rule.cut is not None:
+            evidence["threshold"] = float(ruling.rule.cut)
         return decide(
-            episode,
-            scores,
-            self.rule_,
-            abstained=abstained,
-            words=words,
+            seen,
+            ruling.rule,
             evidence=evidence,
-            no_rule=self.no_rule_,
+            no_rule=ruling.no_rule,
             revision=revision,
             by=by,
-            state_hash=self.state_hash,
+            state_hash=ruling.state_hash,
         )
 
+    def decide(self, episode: Episode, revision: int = 1, by: str = CURATOR) -> Decision:
+        """Examine one episode and decide on it, without a look at the dataset.
+
+        Raises:
+            NotFittedError: before `fit`.
+        """
+        return self.judge(self.examine(episode), revision=revision, by=by)
+
     @property
-    def state_hash(self) -> str:
-        """SHA-256 over configuration, sorted reference ids and everything learned.
+    def scoring_hash(self) -> str:
+        """SHA-256 over scorers, length control, sorted reference ids and everything learned.
 
         Raises:
             NotFittedError: before `fit`.
         """
         self._check_fitted()
-        return self.state_hash_
+        return self.scoring_hash_
 
-    def _hash(self) -> str:
-        rule = self.rule_
+    @property
+    def state_hash(self) -> str:
+        """SHA-256 over `scoring_hash` and the rule, as far as the reference has fitted it.
+
+        Raises:
+            NotFittedError: before `fit`.
+        """
+        self._check_fitted()
+        return self.ruling_.state_hash
+
+    def _hash_scoring(self) -> str:
         state = {
             "version": _STATE_VERSION,
             "scorers": {
@@ -308,13 +516,8 @@ class Curation:
                 for name, scorer in self.scorers_.items()
             },
             "length": self.length_.describe(),
-            "rule": {
-                "name": self.rule,
-                "scorer": self.rule_scorer,
-                "params": self.rule_params,
-                "fitted": rule.fitted() if rule is not None else self.no_rule_,
-            },
             "reference": self.reference_ids_,
+            "dataset": self.dataset_ids_,
         }
         digest = hashlib.sha256()
         _feed(digest, state)
@@ -343,11 +546,20 @@ class Curation:
             if name in self.unfitted_:
                 line += f"; abstains: {self.unfitted_[name]}"
             lines.append(line)
-        if self.rule_ is None:
-            lines.append(f"rule {self.rule}: review: {self.no_rule_}")
+        if self.ruling_.rule is not None:
+            lines.append(f"rule {self.rule}: {self.ruling_.rule.describe()}")
+        elif self._make_rule().needs == "dataset":
+            lines.append(f"rule {self.rule}: {self._make_rule().describe()}")
         else:
-            lines.append(f"rule {self.rule}: {self.rule_.describe()}")
+            lines.append(f"rule {self.rule}: review: {self.ruling_.no_rule}")
         return "\n".join(lines)
+
+
+def _seen(what: str, scores: Mapping[str, float]) -> dict[str, Any]:
+    """What a rule was fitted on, as plain JSON."""
+    digest = hashlib.sha256()
+    _feed(digest, scores)
+    return {"what": what, "episodes": len(scores), "hash": digest.hexdigest()}
 
 
 def _fits(value: object, default: object) -> bool:

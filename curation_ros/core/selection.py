@@ -14,6 +14,7 @@ import numpy as np
 
 from curation_ros.core.decisions import Decision
 from curation_ros.core.errors import ConfigError
+from curation_ros.core.separation import split_scores
 from curation_ros.core.stream import Floats
 
 Span = tuple[int, int]
@@ -25,6 +26,7 @@ KEEP_RULES: dict[str, str] = {
     "top-fraction": "keep the best share of the scored episodes, value from 0 to 1",
     "top-k": "keep the best, value a number of episodes",
     "threshold": "keep scores at or above the value",
+    "gap": "keep the upper of two clearly separated groups; no value",
     "all": "keep every episode; no value",
 }
 
@@ -60,8 +62,8 @@ class Selection:
 
     Attributes:
         entries: what is kept, best first; where nothing ranks, in the order of the tie keys.
-        abstained: ids of the episodes that the rule had nothing to judge by; not kept, except by
-            the rule `all`, which asks for nothing.
+        abstained: ids of the episodes that the rule had nothing to judge by, or that lie between
+            the groups of `gap`; not kept, except by the rule `all`, which asks for nothing.
         kept_of: number of candidates.
     """
 
@@ -104,6 +106,7 @@ def select(
     *,
     seed: int = 0,
     tie: TieKey | None = None,
+    resolution: float = 0.0,
 ) -> Selection:
     """Choose episodes by a keep rule.
 
@@ -114,10 +117,12 @@ def select(
         seed: seed of the tie keys.
         tie: episode id -> key that orders equal scores; by default `tie_key(seed, id)`. Where
             task, start and repetition are known, `tie_key(seed, task, start, repetition)`.
+        resolution: difference in score that counts as none (`Scorer.resolution`), for `gap`.
 
     Raises:
         ConfigError: if the rule does not exist, its value makes no sense, an episode is there
-            twice or has a score that is not finite, or top-k asks for more than are scored.
+            twice or has a score that is not finite, top-k asks for more than are scored, or gap
+            finds no two groups.
     """
     pool = list(candidates)
     _check_candidates(pool)
@@ -141,21 +146,50 @@ def select(
         )
         silent = tuple(c.episode for c in pool if c.decision is None)
         return Selection(entries, silent, len(pool))
-    ranked = sorted(((c.score, c) for c in pool if c.score is not None), key=lambda pair: -pair[0])
+    known = {c.episode: c for c in pool}
+    scores = {c.episode: c.score for c in pool if c.score is not None}
     silent = tuple(c.episode for c in pool if c.score is None)
-    limit = float(value or 0.0)
-    if rule == "threshold":
-        n_kept = sum(score >= limit for score, _ in ranked)
-    elif rule == "top-k":
-        n_kept = int(limit)
-        if n_kept > len(ranked):
-            raise ConfigError(
-                f"top-k {n_kept}: only {len(ranked)} of {len(pool)} episodes have a score"
-            )
+    order = ranking(scores, lambda i: ties(known[i]))
+    if rule == "gap":
+        split = split_scores(list(scores.values()), resolution=resolution)
+        if split.cut is None:
+            raise ConfigError(f"keep rule 'gap': no two groups to choose from: {split.why}")
+        low, high = split.doubt
+        silent += tuple(i for i in order if low < scores[i] < high)
+        order = [i for i in order if scores[i] > split.cut and i not in silent]
+        n_kept = len(order)
+    elif rule == "threshold":
+        n_kept = sum(score >= float(value or 0.0) for score in scores.values())
     else:
-        n_kept = math.floor(limit * len(ranked) + 0.5)
-    kept = tuple(Entry(c.episode, c.name) for _, c in ranked[:n_kept])
+        n_kept = keep_count(rule, value, len(order))
+        if n_kept > len(order):
+            raise ConfigError(
+                f"top-k {n_kept}: only {len(order)} of {len(pool)} episodes have a score"
+            )
+    kept = tuple(Entry(i, known[i].name) for i in order[:n_kept])
     return Selection(kept, silent, len(pool))
+
+
+def ranking(scores: Mapping[str, float], tie: Callable[[str], Any]) -> list[str]:
+    """Ids from the best score to the worst, equal scores in the order of their tie keys.
+
+    Args:
+        scores: id -> score.
+        tie: id -> key that can be ordered.
+    """
+    return sorted(scores, key=lambda i: (-scores[i], tie(i)))
+
+
+def keep_count(rule: str, value: float | None, n: int) -> int:
+    """How many of n ranked episodes a rule keeps; `top-k` may ask for more than there are.
+
+    Raises:
+        ConfigError: if the rule takes no such value.
+    """
+    _check_value(rule, value)
+    if rule == "top-k":
+        return int(value or 0)
+    return math.floor(float(value or 0.0) * n + 0.5)
 
 
 def _by_id(seed: int) -> TieKey:
@@ -185,6 +219,7 @@ def _check_value(rule: str, value: float | None) -> None:
         "top-fraction": value is not None and 0 < value <= 1,
         "top-k": value is not None and value >= 1 and float(value).is_integer(),
         "threshold": value is not None and math.isfinite(value),
+        "gap": value is None,
     }
     if not good[rule]:
         raise ConfigError(f"keep rule {rule!r} with value {value!r}: {KEEP_RULES[rule]}")

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from episodes import copied, make_episode, make_reference, shifted
 
-from curation_ros.core.decisions import RULES, Decision
+from curation_ros.core.decisions import Decision
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
 from curation_ros.core.findings import Finding
-from curation_ros.core.scorers import SCORERS
+from curation_ros.core.rules import RULES
+from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS
 from curation_ros.core.scoring import Curation
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -65,7 +66,7 @@ def test_references_themselves_are_kept(curation: Curation, reference: list[Epis
     assert {curation.decide(e).verdict for e in reference} == {"keep"}
 
 
-@pytest.mark.parametrize("rule_scorer", list(SCORERS))
+@pytest.mark.parametrize("rule_scorer", DEFAULT_SCORERS)
 def test_any_scorer_may_decide(
     rule_scorer: str, reference: list[Episode], rng: np.random.Generator
 ) -> None:
@@ -83,7 +84,7 @@ def test_reference_is_scored_by_scorers_that_had_not_seen_it(
 ) -> None:
     curation = Curation(rule_scorer=rule_scorer).fit(reference)
     seen = [curation.score(e)[0][rule_scorer] for e in reference]
-    rule = curation.rule_
+    rule = curation.ruling_.rule
     assert rule is not None
     assert rule.fitted()["low_"] < min(s for s in seen if s is not None)
 
@@ -105,7 +106,7 @@ def test_no_reference_leaves_everything_for_review(rng: np.random.Generator) -> 
     curation = Curation().fit([])
     decision = curation.decide(make_episode(rng, open_at=140))
     assert (decision.verdict, decision.reason) == ("review", "no reference")
-    needing = {k for k, s in SCORERS.items() if s.needs == "reference"}
+    needing = {k for k in DEFAULT_SCORERS if SCORERS[k].needs == "reference"}
     assert {k for k, v in decision.abstained.items() if v == "no reference"} == needing
     assert decision.scores["gripper_timing"] == 140 / 240
     assert decision.evidence["length_steps"] is None
@@ -151,7 +152,7 @@ def test_degenerate_episodes_are_review_and_never_raise(curation: Curation) -> N
     for episode in (make_episode(n_steps=0), make_episode(n_steps=1), make_episode(n_steps=2)):
         decision = curation.decide(episode)
         assert decision.verdict == "review"
-        assert set(decision.scores) == set(SCORERS)
+        assert set(decision.scores) == set(DEFAULT_SCORERS)
         assert all((v is None) == (k in decision.abstained) for k, v in decision.scores.items())
 
 
@@ -301,8 +302,8 @@ def test_describe_says_what_scores_what_it_needs_and_the_threshold(
     reference: list[Episode],
 ) -> None:
     text = Curation().fit(reference[:3]).describe()
-    for name, scorer in SCORERS.items():
-        assert f"scorer {name}: needs {scorer.needs}" in text
+    for name in DEFAULT_SCORERS:
+        assert f"scorer {name}: needs {SCORERS[name].needs}" in text
     assert "shortest-reference, 234 steps" in text
     assert "only 3 reference episodes" in text
     assert "keep where gripper_timing >= 0.937" in text
