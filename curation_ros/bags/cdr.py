@@ -575,12 +575,10 @@ class _Job:
                 out.append(word.decode())
             except UnicodeDecodeError:
                 out.append("")
-                self._bad.setdefault(
-                    row,
-                    EpisodeError(
-                        f"message of type {self._type_name} is malformed: {word!r:.60} is not UTF-8"
-                    ),
+                fault = (
+                    f"message of type {self._type_name} is malformed: {word!r:.60} is not UTF-8"
                 )
+                self._bad.setdefault(row, EpisodeError(fault))
         return np.array(out, dtype=np.str_)
 
     def _read_one(self, walk: _Walk, row: int) -> None:

@@ -2,44 +2,61 @@
 
 The reader of the mcap package yields half of a record at the end of a torn file and trusts
 lengths; here a record counts only if all of its bytes are there and its checksum is right.
+
+`walk` reads any file in its own order. `read_blocks` gives the same messages of a whole file as
+arrays, found by the indexes of its chunks; an index is believed only as far as what it says can
+be checked in the chunk: with the few records between them, its messages must tile it.
 """
 
 from __future__ import annotations
 
+import functools
 import os
 import struct
+import threading
 import zlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeAlias
 
 import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
+import numpy.typing as npt
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    Channel,
-    ChunkIndex,
-    Footer,
-    Header,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import Channel, Footer, Header, Metadata, MetadataIndex, Schema, Statistics
 
 from curation_ros.core.errors import BagError
+from curation_ros.core.stream import Messages
 
 MAGIC = b"\x89MCAP0\r\n"
 
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQI")
+_CHUNK_INDEX = struct.Struct("<QQQQI")
+_MESSAGE_INDEX = struct.Struct("<HI")
+#: Head of a message record with its opcode and length, and an entry of a message index.
+_MESSAGE_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<i8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_ns", "<u8"),
+        ("publish_ns", "<u8"),
+    ]
+)
+_ENTRY_BYTES = 16
 _FOOTER_BYTES = _RECORD.size + 20 + len(MAGIC)
 _MAX_CHUNK_BYTES = 1 << 30
+# Files up to this size are read at once, and blocks of messages end after this much.
+_SMALL_BYTES = 4 << 20
+_BLOCK_BYTES = 16 << 20
 _FOREIGN = {
     b"SQLite format 3": "a rosbag2 bag in SQLite (.db3); convert it with rosbags-convert",
     b"#ROSBAG V2.0": "a ROS 1 bag; convert it with rosbags-convert",
@@ -150,7 +167,9 @@ def _walk(
                 raise TornFileError(path, "the magic bytes after its footer are missing")
             return
         if opcode == Opcode.CHUNK and not skip_chunk(at):
-            yield from _chunk_records(path, at, stream.read(length), channels)
+            yield from _chunk_records(
+                path, at, _chunk_data(path, at, stream.read(length)), channels
+            )
         elif opcode == Opcode.MESSAGE:
             message = _message(path, at, stream.read(length), 0, length)
             if channels is None or message.channel_id in channels:
@@ -163,10 +182,18 @@ def _walk(
 
 def _parse(path: Path, at: int, opcode: int, body: bytes) -> Record:
     try:
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and len(body) < _SMALL_BYTES >> 8:
+            return _parsed_before(opcode, body)
         return _PARSERS[opcode](ReadDataStream(BytesIO(body)))
     except (McapError, struct.error, ValueError, OverflowError) as err:
         name = Opcode(opcode).name.lower()
         raise TornFileError(path, f"the {name} record at byte {at} is malformed") from err
+
+
+@functools.lru_cache(maxsize=512)
+def _parsed_before(opcode: int, body: bytes) -> Record:
+    """A record that the bags of a dataset have in common; nobody may change it."""
+    return _PARSERS[opcode](ReadDataStream(BytesIO(body)))
 
 
 def _message(path: Path, at: int, data: bytes, start: int, length: int) -> Message:
@@ -177,9 +204,8 @@ def _message(path: Path, at: int, data: bytes, start: int, length: int) -> Messa
 
 
 def _chunk_records(
-    path: Path, at: int, body: bytes, channels: Collection[int] | None
+    path: Path, at: int, data: bytes, channels: Collection[int] | None
 ) -> Iterator[Record]:
-    data = _chunk_data(path, at, body)
     size, place = len(data), 0
     while place < size:
         if size - place < _RECORD.size:
@@ -195,6 +221,20 @@ def _chunk_records(
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             yield _parse(path, at, opcode, data[place : place + length])
         place += length
+
+
+class _PerThread(threading.local):
+    zstd: zstandard.ZstdDecompressor | None = None
+
+
+_PER_THREAD = _PerThread()
+
+
+def _zstd() -> zstandard.ZstdDecompressor:
+    # A new one costs as much as unpacking a small chunk; threads may not share one.
+    if _PER_THREAD.zstd is None:
+        _PER_THREAD.zstd = zstandard.ZstdDecompressor()
+    return _PER_THREAD.zstd
 
 
 def _chunk_data(path: Path, at: int, body: bytes) -> bytes:
@@ -215,7 +255,7 @@ def _chunk_data(path: Path, at: int, body: bytes) -> bytes:
             # -1: the frame does not say.
             if zstandard.frame_content_size(packed) not in (-1, size):
                 raise torn("has another size than it claims")
-            data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+            data = _zstd().decompress(packed, max_output_size=size)
         elif compression == "lz4":
             # Never more than claimed, whatever the frame unpacks to.
             data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size)
@@ -230,6 +270,16 @@ def _chunk_data(path: Path, at: int, body: bytes) -> bytes:
     return bytes(data)
 
 
+class ChunkPlace(NamedTuple):
+    """Where a chunk and the message indexes behind it stand in the file; sizes in bytes."""
+
+    start: int
+    size: int
+    index_size: int
+    unpacked_size: int
+    channels: frozenset[int]
+
+
 @dataclass
 class McapInfo:
     """What a file holds, without its messages.
@@ -239,8 +289,9 @@ class McapInfo:
         schemas, channels: by id.
         counts: channel id -> messages.
         start_ns, end_ns: first and last log time; 0 without messages.
+        data_end: offset behind the last record that is not of the summary, where there is one.
         rosbag2: the last `rosbag2` metadata record, or None.
-        chunk_channels: offset of a chunk -> channels in it, where the file has an index.
+        chunks: its chunks in file order, where the file has an index of each.
     """
 
     profile: str = ""
@@ -249,8 +300,14 @@ class McapInfo:
     counts: dict[int, int] = field(default_factory=dict)
     start_ns: int = 0
     end_ns: int = 0
+    data_end: int = 0
     rosbag2: dict[str, str] | None = None
-    chunk_channels: dict[int, frozenset[int]] = field(default_factory=dict)
+    chunks: list[ChunkPlace] = field(default_factory=list)
+
+    @property
+    def chunk_channels(self) -> dict[int, frozenset[int]]:
+        """Offset of a chunk -> channels in it, where the file says so."""
+        return {c.start: c.channels for c in self.chunks if c.channels}
 
 
 def read_info(path: Path) -> McapInfo:
@@ -311,6 +368,7 @@ def _read_summary(path: Path, stream: BinaryIO) -> McapInfo | None:
         raise TornFileError(path, "its summary has a wrong checksum")
     info, statistics, place = McapInfo(), None, 0
     metadata_at: list[int] = []
+    is_plain = True
     while place + _RECORD.size <= len(summary):
         opcode, length = _RECORD.unpack_from(summary, place)
         body = summary[place + _RECORD.size : place + _RECORD.size + length]
@@ -326,8 +384,14 @@ def _read_summary(path: Path, stream: BinaryIO) -> McapInfo | None:
                 _note_index(info, opcode, body, metadata_at)
             except (McapError, struct.error, ValueError, OverflowError) as err:
                 raise TornFileError(path, f"the index at byte {at} is malformed") from err
+        elif opcode in (Opcode.MESSAGE, Opcode.CHUNK):
+            is_plain = False
     if statistics is None or statistics.channel_count != len(info.channels):
         return None
+    if statistics.chunk_count != len(info.chunks) or not is_plain or place != len(summary):
+        info.chunks = []  # only reading all of it tells what is in this file
+    info.chunks.sort()
+    info.data_end = footer.summary_start
     info.counts = dict(statistics.channel_message_counts)
     if statistics.message_count != sum(info.counts.values()):
         return None
@@ -346,12 +410,271 @@ def _read_summary(path: Path, stream: BinaryIO) -> McapInfo | None:
 
 
 def _note_index(info: McapInfo, opcode: int, body: bytes, metadata_at: list[int]) -> None:
-    stream = ReadDataStream(BytesIO(body))
     if opcode == Opcode.METADATA_INDEX:
-        index = MetadataIndex.read(stream)
+        index = MetadataIndex.read(ReadDataStream(BytesIO(body)))
         if index.name == "rosbag2":
             metadata_at.append(index.offset)
         return
-    chunk = ChunkIndex.read(stream)
-    if chunk.message_index_offsets:
-        info.chunk_channels[chunk.chunk_start_offset] = frozenset(chunk.message_index_offsets)
+    _, _, start, size, map_size = _CHUNK_INDEX.unpack_from(body)
+    rest = _CHUNK_INDEX.size + map_size
+    channels = frozenset(i for i, _ in struct.iter_unpack("<HQ", body[_CHUNK_INDEX.size : rest]))
+    index_size, compression_size = struct.unpack_from("<QI", body, rest)
+    _, unpacked_size = struct.unpack_from("<QQ", body, rest + 12 + compression_size)
+    info.chunks.append(ChunkPlace(start, size, index_size, unpacked_size, channels))
+
+
+class MessageBlock(NamedTuple):
+    """Messages of some channels in file order; every array has a value a message, int64."""
+
+    channels: npt.NDArray[np.int64]
+    sequences: npt.NDArray[np.int64]
+    log_times_ns: npt.NDArray[np.int64]
+    publish_times_ns: npt.NDArray[np.int64]
+    messages: Messages
+
+
+def read_blocks(path: Path, info: McapInfo, channels: Collection[int]) -> Iterator[MessageBlock]:
+    """Read the messages of some channels, many at once; chunks without any are not unpacked.
+
+    The messages are those of `walk`, in its order.
+
+    Args:
+        path: the file.
+        info: what `read_info` said about it.
+        channels: ids of the wanted channels.
+
+    Raises:
+        TornFileError: if the file is damaged, or its index leaves out messages that are there.
+        BagError: if the file is no MCAP file, or cannot be read.
+    """
+    with open_mcap(path) as stream:
+        try:
+            file = _File(stream)
+            indexes = _message_indexes(path, info, file)
+            if indexes is None:
+                yield from _walked_blocks(walk(path, channels=channels))
+            else:
+                yield from _indexed_blocks(path, info, file, indexes, channels)
+        except OSError as err:
+            raise BagError(f"{path}: {err.strerror or err}") from err
+
+
+class _File:
+    """Bytes of a file by offset; a small one is read at once."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._fd = stream.fileno()
+        size = os.fstat(self._fd).st_size
+        self._all = os.pread(self._fd, size, 0) if size <= _SMALL_BYTES else None
+
+    def read(self, at: int, size: int) -> bytes:
+        """Bytes from an offset on; fewer than asked for at the end of the file."""
+        if self._all is not None:
+            return self._all[at : at + size]
+        parts = []
+        while size and (part := os.pread(self._fd, size, at)):
+            parts.append(part)
+            at, size = at + len(part), size - len(part)
+        return b"".join(parts)
+
+
+def _message_indexes(path: Path, info: McapInfo, file: _File) -> list[dict[int, bytes]] | None:
+    """For each chunk the entries of its message indexes by channel.
+
+    None where they do not account for the file: then something stands outside the chunks, a chunk
+    has no index, or they do not sum up to the statistics.
+    """
+    if not info.chunks:
+        return None
+    at = len(MAGIC)
+    indexes = []
+    totals: dict[int, int] = {}
+    for place in info.chunks:
+        head = file.read(place.start, _RECORD.size)
+        if (
+            len(head) < _RECORD.size
+            or _RECORD.unpack(head) != (Opcode.CHUNK, place.size - _RECORD.size)
+            or not _holds_no_message(path, file, at, place.start)
+        ):
+            return None
+        at = place.start + place.size
+        entries = _index_entries(file.read(at, place.index_size))
+        if entries is None:
+            return None
+        at += place.index_size
+        indexes.append(entries)
+        for channel, raw in entries.items():
+            totals[channel] = totals.get(channel, 0) + len(raw) // _ENTRY_BYTES
+    counts = {channel: count for channel, count in info.counts.items() if count}
+    if {channel: count for channel, count in totals.items() if count} != counts:
+        return None
+    return indexes if _holds_no_message(path, file, at, info.data_end) else None
+
+
+def _holds_no_message(path: Path, file: _File, at: int, stop: int) -> bool:
+    """Whether the bytes between chunks are whole records, and none of them holds messages."""
+    while at < stop:
+        head = file.read(at, _RECORD.size)
+        opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, 0)
+        body_at = at + _RECORD.size
+        if opcode in (0, Opcode.MESSAGE, Opcode.CHUNK, Opcode.FOOTER) or length > stop - body_at:
+            return False
+        if opcode in _PARSERS:
+            _parse(path, at, opcode, file.read(body_at, length))
+        at = body_at + length
+    return at == stop
+
+
+def _index_entries(data: bytes) -> dict[int, bytes] | None:
+    """Channel -> entries of its message index; None where the bytes are anything else."""
+    entries: dict[int, bytes] = {}
+    at, head_size = 0, _RECORD.size + _MESSAGE_INDEX.size
+    while at < len(data):
+        if len(data) - at < head_size:
+            return None
+        opcode, length = _RECORD.unpack_from(data, at)
+        channel, size = _MESSAGE_INDEX.unpack_from(data, at + _RECORD.size)
+        at += head_size
+        if (
+            opcode != Opcode.MESSAGE_INDEX
+            or length != _MESSAGE_INDEX.size + size
+            or size % _ENTRY_BYTES
+            or size > len(data) - at
+            or channel in entries
+        ):
+            return None
+        entries[channel] = data[at : at + size]
+        at += size
+    return entries
+
+
+class _Chunk(NamedTuple):
+    at: int
+    data: bytes
+    entries: dict[int, bytes]
+
+
+def _indexed_blocks(
+    path: Path,
+    info: McapInfo,
+    file: _File,
+    indexes: Sequence[dict[int, bytes]],
+    channels: Collection[int],
+) -> Iterator[MessageBlock]:
+    wanted = frozenset(channels)
+    missing = sum(info.counts.get(channel, 0) for channel in wanted)
+    skipped = False
+    group: list[_Chunk] = []
+    for place, entries in zip(info.chunks, indexes, strict=True):
+        if not any(raw for channel, raw in entries.items() if channel in wanted):
+            skipped = True
+            continue
+        body = file.read(place.start + _RECORD.size, place.size - _RECORD.size)
+        group.append(_Chunk(place.start, _chunk_data(path, place.start, body), entries))
+        if sum(len(chunk.data) for chunk in group) >= _BLOCK_BYTES:
+            block = _split(path, group, wanted)
+            missing -= len(block.messages)
+            yield block
+            group = []
+    if group:
+        block = _split(path, group, wanted)
+        missing -= len(block.messages)
+        yield block
+    if missing and skipped:
+        raise TornFileError(path, "its message indexes and its chunks contradict each other")
+
+
+def _split(path: Path, chunks: Sequence[_Chunk], wanted: frozenset[int]) -> MessageBlock:
+    """The wanted messages of unpacked chunks."""
+    block = _split_by_index(path, chunks, wanted)
+    if block is None:
+        records = (r for c in chunks for r in _chunk_records(path, c.at, c.data, wanted))
+        block = _joined([r for r in records if isinstance(r, Message)])
+    return block
+
+
+def _split_by_index(
+    path: Path, chunks: Sequence[_Chunk], wanted: frozenset[int]
+) -> MessageBlock | None:
+    """The wanted messages of unpacked chunks; None where the index does not fit them."""
+    stops = np.cumsum([len(chunk.data) for chunk in chunks])
+    # Some bytes more: whoever gathers whole words reads beyond the last message.
+    buffer = np.frombuffer(b"".join([*(chunk.data for chunk in chunks), bytes(8)]), np.uint8)
+    parts = [(k, c, raw) for k, chunk in enumerate(chunks) for c, raw in chunk.entries.items()]
+    repeats = [len(raw) // _ENTRY_BYTES for _, _, raw in parts]
+    stop = np.repeat(stops[[k for k, _, _ in parts]], repeats)
+    base = np.repeat([int(stops[k]) - len(chunks[k].data) for k, _, _ in parts], repeats)
+    claimed = np.repeat([channel for _, channel, _ in parts], repeats)
+    offsets = np.frombuffer(b"".join([raw for _, _, raw in parts]), "<i8")[1::2]
+    if ((offsets < 0) | (offsets > stop - base - _MESSAGE_HEAD.itemsize)).any():
+        return None
+    order = np.argsort(offsets + base)
+    at, stop, claimed = (offsets + base)[order], stop[order], claimed[order]
+    # A view of the buffer with a head at every byte: picking from it copies only those wanted.
+    n_places = len(buffer) - _MESSAGE_HEAD.itemsize + 1
+    places: npt.NDArray[np.void] = np.ndarray((n_places,), _MESSAGE_HEAD, buffer, 0, (1,))
+    heads = places[at]
+    lengths, channels = heads["length"], heads["channel"]
+    fits = (heads["opcode"] == Opcode.MESSAGE) & (channels == claimed)
+    fits &= (lengths >= _MESSAGE.size) & (lengths <= stop - at - _RECORD.size)
+    if not fits.all():
+        return None
+    ends = np.concatenate([[0], at + lengths + _RECORD.size])
+    begins = np.concatenate([at, stops[-1:]])
+    for k in np.flatnonzero(ends != begins).tolist():
+        if not _gap_holds_no_message(path, chunks, stops, int(ends[k]), int(begins[k])):
+            return None
+    starts, sizes = at + _MESSAGE_HEAD.itemsize, lengths - _MESSAGE.size
+    if not wanted.issuperset(channel for _, channel, raw in parts if raw):
+        rows = np.isin(channels, list(wanted))
+        heads, channels, starts, sizes = heads[rows], channels[rows], starts[rows], sizes[rows]
+    return MessageBlock(
+        channels.astype(np.int64),
+        heads["sequence"].astype(np.int64),
+        heads["log_ns"].astype(np.int64),
+        heads["publish_ns"].astype(np.int64),
+        Messages(buffer, starts, sizes),
+    )
+
+
+def _gap_holds_no_message(
+    path: Path, chunks: Sequence[_Chunk], stops: npt.NDArray[np.int64], at: int, stop: int
+) -> bool:
+    """Whether the bytes between indexed messages are whole records, and none is a message."""
+    while at < stop:
+        k = int(np.searchsorted(stops, at, side="right"))
+        chunk, base = chunks[k], int(stops[k]) - len(chunks[k].data)
+        place, left = at - base + _RECORD.size, min(stop, int(stops[k])) - at - _RECORD.size
+        if left < 0:
+            return False
+        opcode, length = _RECORD.unpack_from(chunk.data, at - base)
+        if opcode == Opcode.MESSAGE or length > left:
+            return False
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            _parse(path, chunk.at, opcode, chunk.data[place : place + length])
+        at += _RECORD.size + length
+    return at == stop
+
+
+def _walked_blocks(records: Iterator[Record]) -> Iterator[MessageBlock]:
+    found: list[Message] = []
+    size = 0
+    for record in records:
+        if isinstance(record, Message):
+            found.append(record)
+            size += len(record.data)
+            if size >= _BLOCK_BYTES:
+                yield _joined(found)
+                found, size = [], 0
+    if found:
+        yield _joined(found)
+
+
+def _joined(found: Sequence[Message]) -> MessageBlock:
+    return MessageBlock(
+        np.array([m.channel_id for m in found], dtype=np.int64),
+        np.array([m.sequence for m in found], dtype=np.int64),
+        np.array([m.log_time_ns for m in found], dtype=np.uint64).astype(np.int64),
+        np.array([m.publish_time_ns for m in found], dtype=np.uint64).astype(np.int64),
+        Messages.joined([m.data for m in found]),
+    )

@@ -11,9 +11,19 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from curation_ros.bags.cdr import CdrDecoder
 from curation_ros.bags.definitions import full_type_name, parse_definition
-from curation_ros.bags.mcap_file import McapInfo, Message, TornFileError, read_info, walk
+from curation_ros.bags.mcap_file import (
+    McapInfo,
+    Message,
+    MessageBlock,
+    TornFileError,
+    read_blocks,
+    read_info,
+    walk,
+)
 from curation_ros.bags.recovery import custom_data_of
 from curation_ros.bags.yaml_text import load_yaml
 from curation_ros.core.builder import EpisodeBuilder
@@ -21,7 +31,7 @@ from curation_ros.core.episode import Episode
 from curation_ros.core.errors import BagError, ConfigError, EpisodeError
 from curation_ros.core.identity import foreign_episode_id
 from curation_ros.core.status import EpisodeEvent, EventKind, event_from_json, owner_findings
-from curation_ros.core.stream import Sample, header_stamp_ns
+from curation_ros.core.stream import Sample, SampleBlock, Stamps, header_stamps_ns
 from curation_ros.core.topic_map import TopicMap, topic_map_from_json
 
 _UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
@@ -162,38 +172,81 @@ class Bag:
                 )
         return found
 
-    def samples(self, topic_map: TopicMap) -> list[Sample]:
-        """All samples of the topics of a map, in file order.
+    def blocks(self, topic_map: TopicMap) -> Iterator[SampleBlock]:
+        """All samples of the topics of a map, many at once; each topic's in file order.
 
         Raises:
             BagError: as `resolve` and `messages`, or where a type has no header although the map
                 takes its stamp from there.
         """
+        for parts in self._parts(topic_map):
+            for _, block in parts:
+                yield block
+
+    def samples(self, topic_map: TopicMap) -> list[Sample]:
+        """All samples of the topics of a map, in file order.
+
+        Raises:
+            BagError: as `blocks`.
+        """
+        out = []
+        for parts in self._parts(topic_map):
+            numbered = [
+                (row, place, Sample(block.topic, stamp_ns, seq, block.messages[k]))
+                for place, (rows, block) in enumerate(parts)
+                for k, (row, stamp_ns, seq) in enumerate(
+                    zip(rows.tolist(), block.stamps_ns.tolist(), block.seqs.tolist(), strict=True)
+                )
+            ]
+            numbered.sort(key=lambda item: item[:2])
+            out += [sample for _, _, sample in numbered]
+        return out
+
+    def _parts(self, topic_map: TopicMap) -> Iterator[list[tuple[Stamps, SampleBlock]]]:
+        """Blocks of file order, split by topic; beside each the rows that it had in its block."""
         resolved = self.resolve(topic_map)
         decoder = self.decoder()
-        for topic in resolved:
-            type_name = topic_map.topics[topic]
-            if topic not in topic_map.source_stamped and not decoder.has_header(type_name):
+        source_stamped = topic_map.source_stamped
+        for topic, type_name in topic_map.topics.items():
+            if topic in resolved and topic not in source_stamped:
+                if decoder.has_header(type_name):
+                    continue
                 raise BagError(
                     f"{self.path}: topic {topic!r}: {type_name} has no header; "
                     "write 'stamp: source' into the topic map"
                 )
-        by_name: dict[str, list[str]] = {}
-        for topic, name in resolved.items():
-            by_name.setdefault(name, []).append(topic)
-        out = []
-        for message in self.messages(by_name):
-            for topic in by_name[message.topic]:
-                try:
-                    stamp_ns = (
-                        message.publish_time_ns
-                        if topic in topic_map.source_stamped
-                        else header_stamp_ns(message.data)
-                    )
-                except EpisodeError as err:
-                    raise BagError(f"{self.path}: topic {message.topic}: {err}") from err
-                out.append(Sample(topic, stamp_ns, message.sequence, message.data))
-        return out
+        for path, info in zip(self.mcap_paths, self._infos, strict=True):
+            ids: dict[str, list[int]] = {name: [] for name in resolved.values()}
+            for channel in info.channels.values():
+                if channel.topic in ids:
+                    ids[channel.topic].append(channel.id)
+            wanted = [channel_id for same in ids.values() for channel_id in same]
+            for block in read_blocks(path, info, wanted) if wanted else ():
+                parts = []
+                for topic, name in resolved.items():
+                    same = ids[name]
+                    if len(same) == 1:
+                        rows = np.flatnonzero(block.channels == same[0])
+                    else:
+                        rows = np.flatnonzero(np.isin(block.channels, same))
+                    stamped = topic in source_stamped
+                    parts.append((rows, self._sample_block(topic, name, block, rows, stamped)))
+                yield parts
+
+    def _sample_block(
+        self, topic: str, name: str, block: MessageBlock, rows: Stamps, source_stamped: bool
+    ) -> SampleBlock:
+        messages = block.messages.take(rows)
+        if source_stamped:
+            stamps_ns = block.publish_times_ns[rows]
+            if (stamps_ns < 0).any():
+                raise BagError(f"{self.path}: topic {name}: a publish time is above 2**63 ns")
+        else:
+            try:
+                stamps_ns = header_stamps_ns(messages)
+            except EpisodeError as err:
+                raise BagError(f"{self.path}: topic {name}: {err}") from err
+        return SampleBlock(topic, stamps_ns, block.sequences[rows], messages)
 
     def event(self) -> EpisodeEvent | None:
         """What the owner of the episode said; None for a bag that is not ours.
@@ -412,13 +465,14 @@ def episode_of(bag: Bag, topic_map: TopicMap | None = None) -> Episode:
     topic_map = topic_map or bag.topic_map()
     if topic_map is None:
         raise BagError(f"{bag.path} was not recorded by this package: give a topic map")
-    samples = bag.samples(topic_map)
-    event = episode_event(bag, topic_map, samples)
+    blocks = list(bag.blocks(topic_map))
+    clock = [b.stamps_ns for b in blocks if b.topic == topic_map.clock_topic]
+    event = _event_of(bag, topic_map, np.concatenate([*clock, np.empty(0, dtype=np.int64)]))
     builder = EpisodeBuilder(
         topic_map, bag.decoder(), episode_id=event.id, name=event.name, start_ns=event.start_ns
     )
-    for sample in samples:
-        builder.push(sample)
+    for block in blocks:
+        builder.push_block(block)
     end_ns = event.end_ns if event.end_ns is not None else event.start_ns
     return builder.finish(end_ns, event.counts, owner_findings(event))
 
@@ -439,19 +493,23 @@ def episode_event(bag: Bag, topic_map: TopicMap, samples: Sequence[Sample]) -> E
         BagError: if a bag that is not ours has nothing on its clock topic.
     """
     clock = [s.stamp_ns for s in samples if s.topic == topic_map.clock_topic]
+    return _event_of(bag, topic_map, np.array(clock, dtype=np.int64))
+
+
+def _event_of(bag: Bag, topic_map: TopicMap, clock: Stamps) -> EpisodeEvent:
     event = bag.event()
     if event is None:
-        if not clock:
+        if not len(clock):
             raise BagError(
                 f"{bag.path}: no message of the clock topic {topic_map.clock_topic!r}; "
                 f"the bag has {', '.join(sorted(bag.topics)) or 'no topics'}"
             )
-        start_ns = min(clock)
+        start_ns = int(clock.min())
         episode_id = foreign_episode_id(bag.sha256, start_ns)
-        event = EpisodeEvent(episode_id, bag.name, "ended", start_ns, max(clock))
+        event = EpisodeEvent(episode_id, bag.name, "ended", start_ns, int(clock.max()))
     if event.end_ns is None:  # the recorder died before it was said
         kind: EventKind = "aborted" if event.event == "aborted" else "ended"
-        event = replace(event, event=kind, end_ns=max([event.start_ns, *clock]))
+        event = replace(event, event=kind, end_ns=max([event.start_ns, *clock.tolist()]))
     if bag.custom_data.get("recovered") == "true":
         tail = bag.custom_data.get("recovered_tail", "unknown")
         line = f"recovered: recovered after its recorder died; reading stopped: {tail}"

@@ -70,6 +70,10 @@ class Messages:
         """Some of the messages, in the same buffer."""
         return Messages(self.buffer, self.starts[rows], self.sizes[rows])
 
+    def compact(self) -> Messages:
+        """The same messages in a buffer of their own."""
+        return Messages.joined([self[row] for row in range(len(self))])
+
     @classmethod
     def joined(cls, messages: Sequence[bytes]) -> Messages:
         """Single messages side by side."""
@@ -79,7 +83,7 @@ class Messages:
 
 
 class SampleBlock(NamedTuple):
-    """Samples of one topic in their order; each array has a value a message, as Sample names it."""
+    """Samples of one topic in their order; its arrays have a value a message."""
 
     topic: str
     stamps_ns: Stamps
