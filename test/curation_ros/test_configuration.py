@@ -16,7 +16,7 @@ from curation_ros.configuration import (
     topic_map_or_default,
 )
 from curation_ros.core.errors import BagError, ConfigError
-from curation_ros.core.scorers import SCORERS
+from curation_ros.core.scorers import DEFAULT_SCORERS
 from curation_ros.core.scoring import Curation
 from curation_ros.core.topic_map import read_topic_map
 from curation_ros.dataset import Dataset
@@ -50,7 +50,7 @@ def test_topic_map_of_an_empty_path_is_that_of_the_libero_robot(tmp_path: Path) 
 
 def test_shipped_config_has_every_scorer_and_makes_a_curation() -> None:
     curation = read_curation(share_file("config/curation.yaml"), {})
-    assert set(curation.scorers) == set(SCORERS)
+    assert set(curation.scorers) == set(DEFAULT_SCORERS)
     assert curation.rule_scorer in curation.scorers
 
 

@@ -5,16 +5,20 @@ from __future__ import annotations
 from curation_ros.core.scorers.ensemble import Ensemble
 from curation_ros.core.scorers.entropy import Entropy
 from curation_ros.core.scorers.gripper_timing import GripperTiming
-from curation_ros.core.scorers.isolation_forest import IsolationForest
-from curation_ros.core.scorers.knn import NearestNeighbours
+from curation_ros.core.scorers.isolation_forest import IsolationForest, LabelFreeIsolationForest
+from curation_ros.core.scorers.knn import LabelFreeNearestNeighbours, NearestNeighbours
 from curation_ros.core.scorers.length import Length
+from curation_ros.core.scorers.pool import PoolScorer
 from curation_ros.core.scorers.scorer import Abstain, Need, Scorer
 from curation_ros.core.scorers.smoothness import Smoothness
-from curation_ros.core.scorers.trajectory_alignment import TrajectoryAlignment
+from curation_ros.core.scorers.trajectory_alignment import (
+    LabelFreeTrajectoryAlignment,
+    TrajectoryAlignment,
+)
 
-__all__ = ["SCORERS", "Abstain", "Need", "Scorer"]
+__all__ = ["DEFAULT_SCORERS", "SCORERS", "Abstain", "Need", "PoolScorer", "Scorer"]
 
-#: Name -> class, in the order of the paper, then our own.
+#: Name -> class: those of the paper in its order, the baseline, the label-free twins.
 SCORERS: dict[str, type[Scorer]] = {
     "smoothness": Smoothness,
     "entropy": Entropy,
@@ -24,4 +28,10 @@ SCORERS: dict[str, type[Scorer]] = {
     "knn": NearestNeighbours,
     "trajectory_alignment": TrajectoryAlignment,
     "length": Length,
+    "isolation_forest_label_free": LabelFreeIsolationForest,
+    "knn_label_free": LabelFreeNearestNeighbours,
+    "trajectory_alignment_label_free": LabelFreeTrajectoryAlignment,
 }
+
+#: What scores where nothing is asked for: a twin needs the whole dataset, so it must be asked for.
+DEFAULT_SCORERS = tuple(name for name, scorer in SCORERS.items() if scorer.needs != "dataset")

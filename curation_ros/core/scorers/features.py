@@ -93,14 +93,36 @@ def reference_features(rows: Sequence[Floats], episodes: Sequence[Episode], leas
     return np.array(rows)
 
 
-def check_width(found: int, expected: int, what: str) -> None:
-    """Refuse an episode of another robot than the reference's.
+def check_width(found: int, expected: int, what: str, of: str = "reference") -> None:
+    """Refuse an episode of another robot than that of the reference, or of the dataset.
 
     Raises:
         Abstain: if the widths differ.
     """
     if found != expected:
-        raise Abstain(f"{what}: {found} values, the reference has {expected}")
+        raise Abstain(f"{what}: {found} values, the {of} has {expected}")
+
+
+def start_state(episode: Episode) -> Floats:
+    """Where an episode started, from its data: what repetitions of one start share.
+
+    Returns:
+        (S,) first row of the fields with role object; where the map has none, of the effectors.
+
+    Raises:
+        Abstain: if there is no such field or row, or it is not finite.
+    """
+    topic_map = episode.topic_map
+    specs = topic_map.with_role("object") or topic_map.with_role("effector")
+    if not specs or not len(episode):
+        raise Abstain("its start is unknown: no step, or neither object nor effector in the map")
+    missing = [spec.name for spec in specs if spec.name not in episode.fields]
+    if missing:
+        raise Abstain(f"its start lacks the field {missing[0]!r}")
+    start = np.concatenate([episode.fields[spec.name][0] for spec in specs])
+    if not np.isfinite(start).all():
+        raise Abstain("its start is not finite")
+    return start
 
 
 def phase_name(episode: Episode, step: int) -> str | None:

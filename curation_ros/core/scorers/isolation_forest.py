@@ -1,14 +1,16 @@
-"""How easily random splits isolate an episode from the reference."""
+"""How easily random splits isolate an episode from the others."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from curation_ros.core.errors import ConfigError, EpisodeError
 from curation_ros.core.scorers.features import check_width, moving_action, reference_features
+from curation_ros.core.scorers.pool import PoolScorer, outside
 from curation_ros.core.scorers.scorer import Abstain, Scorer
 
 if TYPE_CHECKING:
@@ -20,9 +22,42 @@ if TYPE_CHECKING:
 _EULER_GAMMA = 0.5772156649015329
 
 
-def _features(episode: Episode) -> Floats:
+class Forest(NamedTuple):
+    """Isolation trees as flat arrays: scored without scikit-learn, and hashable by content.
+
+    Attributes:
+        feature: (trees, nodes) feature that a node splits on, -1 in a leaf.
+        threshold: (trees, nodes) go left where the feature is at most this.
+        left, right: (trees, nodes) children; a leaf is its own child.
+        depth: (trees, nodes) expected depth of a point that ends in this leaf.
+        levels: depth of the deepest tree.
+        normaliser: number that the summed depth is divided by.
+    """
+
+    feature: npt.NDArray[np.int64]
+    threshold: Floats
+    left: npt.NDArray[np.int64]
+    right: npt.NDArray[np.int64]
+    depth: Floats
+    levels: int
+    normaliser: float
+
+    def score(self, row: Floats) -> float:
+        """scikit-learn's `score_samples` of one (F,) row: between -1 (isolated at once) and 0."""
+        row = row.astype(np.float32).astype(np.float64)  # scikit-learn's trees compare float32
+        trees = np.arange(len(self.feature))
+        node = np.zeros(len(trees), dtype=np.int64)
+        for _ in range(self.levels):
+            left = row[self.feature[trees, node]] <= self.threshold[trees, node]
+            node = np.where(left, self.left[trees, node], self.right[trees, node])
+        return -float(2.0 ** (-self.depth[trees, node].sum() / self.normaliser))
+
+
+def _features(episode: Episode, of: str) -> Floats:
     """(5 A,) mean, standard deviation, maximum, minimum and root mean square of each action."""
     action = moving_action(episode)
+    if of == "magnitudes":
+        action = np.abs(action)
     return np.concatenate(
         [
             action.mean(axis=0),
@@ -41,20 +76,55 @@ def _mean_search_length(n: Floats) -> Floats:
     return np.where(n > 2, long, np.where(n == 2, 1.0, 0.0))
 
 
+def _grow(table: Floats, n_trees: int, max_samples: int, seed: int) -> Forest:
+    """Grow a forest on (n, F) features, n >= 2."""
+    # Importing scikit-learn takes seconds: only who fits a forest waits for it.
+    from sklearn import ensemble
+
+    n_samples = min(max_samples, len(table))
+    forest = ensemble.IsolationForest(
+        n_estimators=n_trees, max_samples=n_samples, random_state=seed
+    ).fit(table)
+    trees = [estimator.tree_ for estimator in forest.estimators_]
+    shape = (len(trees), max(t.node_count for t in trees))
+    grown = Forest(
+        feature=np.full(shape, -1, dtype=np.int64),
+        threshold=np.zeros(shape),
+        left=np.zeros(shape, dtype=np.int64),
+        right=np.zeros(shape, dtype=np.int64),
+        depth=np.zeros(shape),
+        levels=max(int(t.max_depth) for t in trees),
+        normaliser=len(trees) * float(_mean_search_length(np.array(float(n_samples)))),
+    )
+    for k, tree in enumerate(trees):
+        nodes = np.arange(tree.node_count)
+        leaf = tree.children_left < 0
+        grown.feature[k, nodes] = np.where(leaf, -1, tree.feature)
+        grown.threshold[k, nodes] = tree.threshold
+        grown.left[k, nodes] = np.where(leaf, nodes, tree.children_left)
+        grown.right[k, nodes] = np.where(leaf, nodes, tree.children_right)
+        depth = _mean_search_length(tree.n_node_samples.astype(np.float64))
+        level, n_above = nodes[:1], 0
+        while len(level):
+            depth[level] += n_above
+            inner = level[~leaf[level]]
+            level = np.concatenate([tree.children_left[inner], tree.children_right[inner]])
+            n_above += 1
+        grown.depth[k, nodes] = depth
+    return grown
+
+
 class IsolationForest(Scorer):
     """Isolation forest on per-dimension statistics of the action (the paper's, fitted on clean).
 
-    scikit-learn grows the trees; `fit` keeps them as flat arrays, so that one episode is scored
-    in well under a millisecond, and the fitted state can be hashed. The score is scikit-learn's
-    `score_samples`: between -1 (isolated at once) and 0.
+    'Action magnitudes per dimension' can be read in two ways: `of='signed'` takes the statistics
+    of the actions as they are, `of='magnitudes'` of their absolute values. scikit-learn grows the
+    trees; they are kept as flat arrays, so that one episode is scored in well under a
+    millisecond, and the fitted state can be hashed. The score is scikit-learn's `score_samples`:
+    between -1 (isolated at once) and 0.
 
     Attributes:
-        feature_: (trees, nodes) feature that a node splits on, -1 in a leaf.
-        threshold_: (trees, nodes) go left where the feature is at most this.
-        left_, right_: (trees, nodes) children; a leaf is its own child.
-        depth_: (trees, nodes) expected depth of a point that ends in this leaf.
-        normaliser_: number that the summed depth is divided by.
-        levels_: depth of the deepest tree.
+        forest_: the trees.
         n_features_: width of the features.
 
     Source: Liu, Ting, Zhou, ICDM 2008. Differences: none; scores are negated to point upwards.
@@ -62,70 +132,119 @@ class IsolationForest(Scorer):
 
     needs = "reference"
     resolution = 0.01
+    choices: ClassVar = {"of": ("signed", "magnitudes")}
 
-    def __init__(self, *, n_trees: int = 100, max_samples: int = 256, seed: int = 0) -> None:
-        """Store the size of the forest, the episodes drawn for a tree, and the seed."""
+    def __init__(
+        self,
+        *,
+        n_trees: int = 100,
+        max_samples: int = 256,
+        seed: int = 0,
+        of: str = "signed",
+    ) -> None:
+        """Store the parameters.
+
+        Args:
+            n_trees: size of the forest.
+            max_samples: episodes drawn for a tree.
+            seed: of the random splits.
+            of: what the statistics are taken of.
+        """
         self.n_trees = n_trees
         self.max_samples = max_samples
         self.seed = seed
+        self.of = of
 
     def check_params(self) -> None:
         """Check the ranges."""
-        if self.n_trees < 1 or self.max_samples < 2:
-            raise ConfigError(
-                "IsolationForest: expected n_trees >= 1 and max_samples >= 2, found "
-                f"{self.n_trees} and {self.max_samples}"
-            )
+        super().check_params()
+        _check_sizes(self)
 
     def fit(self, episodes: Sequence[Episode]) -> Self:
         """Grow the trees; at least two reference episodes."""
-        # Importing scikit-learn takes seconds: only who fits a forest waits for it.
-        from sklearn import ensemble
-
         self.check_params()
         try:
-            rows = [_features(e) for e in episodes]
+            rows = [_features(e, self.of) for e in episodes]
         except Abstain as reason:
             raise EpisodeError(f"a reference episode cannot be used: {reason}") from None
         table = reference_features(rows, episodes, least=2)
-        n_samples = min(self.max_samples, len(table))
-        forest = ensemble.IsolationForest(
-            n_estimators=self.n_trees, max_samples=n_samples, random_state=self.seed
-        ).fit(table)
-        trees = [estimator.tree_ for estimator in forest.estimators_]
-        shape = (len(trees), max(t.node_count for t in trees))
-        self.feature_ = np.full(shape, -1, dtype=np.int64)
-        self.threshold_ = np.zeros(shape)
-        self.left_ = np.zeros(shape, dtype=np.int64)
-        self.right_ = np.zeros(shape, dtype=np.int64)
-        self.depth_ = np.zeros(shape)
-        for k, tree in enumerate(trees):
-            nodes = np.arange(tree.node_count)
-            leaf = tree.children_left < 0
-            self.feature_[k, nodes] = np.where(leaf, -1, tree.feature)
-            self.threshold_[k, nodes] = tree.threshold
-            self.left_[k, nodes] = np.where(leaf, nodes, tree.children_left)
-            self.right_[k, nodes] = np.where(leaf, nodes, tree.children_right)
-            depth = np.zeros(tree.node_count)
-            for node in nodes[~leaf]:  # children come after their parent
-                depth[[tree.children_left[node], tree.children_right[node]]] = depth[node] + 1
-            self.depth_[k, nodes] = depth + _mean_search_length(
-                tree.n_node_samples.astype(np.float64)
-            )
-        self.levels_ = max(int(t.max_depth) for t in trees)
-        self.normaliser_ = len(trees) * float(_mean_search_length(np.array(float(n_samples))))
+        self.forest_ = _grow(table, self.n_trees, self.max_samples, self.seed)
         self.n_features_ = table.shape[1]
         return self
 
     def score(self, episode: Episode) -> float:
         """Between -1 and 0; an episode that nothing tells from the reference is near -0.4."""
         self._check_fitted()
-        row = _features(episode)
+        row = _features(episode, self.of)
         check_width(len(row), self.n_features_, "features of the action")
-        row = row.astype(np.float32).astype(np.float64)  # scikit-learn's trees compare float32
-        trees = np.arange(len(self.feature_))
-        node = np.zeros(len(trees), dtype=np.int64)
-        for _ in range(self.levels_):
-            left = row[self.feature_[trees, node]] <= self.threshold_[trees, node]
-            node = np.where(left, self.left_[trees, node], self.right_[trees, node])
-        return -float(2.0 ** (-self.depth_[trees, node].sum() / self.normaliser_))
+        return self.forest_.score(row)
+
+
+class LabelFreeIsolationForest(PoolScorer):
+    """Isolation forest grown on the dataset itself, without the episodes of the same start.
+
+    Features and score as those of `isolation_forest`; one forest for each fold of starts.
+
+    Attributes:
+        forests_: the forest grown outside each fold, and the last of all episodes; None where
+            fewer than two episodes are left.
+    """
+
+    resolution = 0.01
+    choices: ClassVar = {"of": ("signed", "magnitudes")}
+
+    def __init__(
+        self,
+        *,
+        n_trees: int = 100,
+        max_samples: int = 256,
+        seed: int = 0,
+        of: str = "signed",
+        same_start: float = 1e-3,
+        min_others: int = 5,
+    ) -> None:
+        """Store the parameters.
+
+        Args:
+            n_trees: size of each forest.
+            max_samples: episodes drawn for a tree.
+            seed: of the random splits.
+            of: what the statistics are taken of.
+            same_start: starts that differ by no more than this in any number are the same.
+            min_others: episodes of other starts that it takes to judge one.
+        """
+        self.n_trees = n_trees
+        self.max_samples = max_samples
+        self.seed = seed
+        self.of = of
+        self.same_start = same_start
+        self.min_others = min_others
+
+    def check_params(self) -> None:
+        """Check the ranges."""
+        super().check_params()
+        _check_sizes(self)
+
+    def _features(self, episode: Episode) -> Floats:
+        return _features(episode, self.of)
+
+    def _learn(self, features: Floats, fold: npt.NDArray[np.int64]) -> None:
+        self.forests_ = tuple(
+            _grow(features[mask], self.n_trees, self.max_samples, self.seed)
+            if mask.sum() >= 2
+            else None
+            for mask in outside(fold)
+        )
+
+    def _judge(self, features: Floats, model: int) -> float:
+        forest = self.forests_[model]
+        assert forest is not None  # min_others >= 2
+        return forest.score(features)
+
+
+def _check_sizes(scorer: IsolationForest | LabelFreeIsolationForest) -> None:
+    if scorer.n_trees < 1 or scorer.max_samples < 2:
+        raise ConfigError(
+            f"{type(scorer).__name__}: expected n_trees >= 1 and max_samples >= 2, found "
+            f"{scorer.n_trees} and {scorer.max_samples}"
+        )

@@ -1,4 +1,4 @@
-"""Distance to the nearest reference episodes."""
+"""Distance to the nearest other episodes."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from curation_ros.core.errors import ConfigError, EpisodeError
 from curation_ros.core.scorers.features import (
@@ -15,6 +16,7 @@ from curation_ros.core.scorers.features import (
     moving_action,
     reference_features,
 )
+from curation_ros.core.scorers.pool import PoolScorer, outside
 from curation_ros.core.scorers.scorer import Abstain, Scorer
 
 if TYPE_CHECKING:
@@ -30,13 +32,22 @@ def _features(episode: Episode) -> Floats:
     )
 
 
+def _scaling(table: Floats, scale_floor: float, standardised: bool) -> tuple[Floats, Floats]:
+    """(F,) mean and (F,) scale that features are standardised by; 0 and 1 if they are not."""
+    if not standardised or not len(table):
+        return np.zeros(table.shape[1]), np.ones(table.shape[1])
+    return table.mean(axis=0), np.maximum(table.std(axis=0), scale_floor)
+
+
 class NearestNeighbours(Scorer):
     """Negative mean distance to the k nearest reference episodes (the paper's 'kNN').
 
-    Features: mean, standard deviation and root mean square of each column of state and action,
-    each standardised by the reference. An episode is never its own neighbour, by id. Where fewer
-    than k others are left, `few='use'` takes those there are (`describe` of the curation says how
-    many the reference has) and `few='abstain'` does not score.
+    Features: mean, standard deviation and root mean square of each column of state and action.
+    The paper does not say whether they are scaled: by default each is standardised by the
+    reference, with `standardised=False` the columns of the largest unit decide. An episode is
+    never its own neighbour, by id. Where fewer than k others are left, `few='use'` takes those
+    there are (`describe` of the curation says how many the reference has) and `few='abstain'`
+    does not score.
 
     Attributes:
         ids_: ids of the reference episodes.
@@ -49,7 +60,14 @@ class NearestNeighbours(Scorer):
     resolution = 0.1
     choices: ClassVar = {"few": ("use", "abstain")}
 
-    def __init__(self, *, k: int = 5, scale_floor: float = 2e-3, few: str = "use") -> None:
+    def __init__(
+        self,
+        *,
+        k: int = 5,
+        scale_floor: float = 2e-3,
+        few: str = "use",
+        standardised: bool = True,
+    ) -> None:
         """Store the parameters.
 
         Args:
@@ -58,19 +76,17 @@ class NearestNeighbours(Scorer):
                 unit; without it, columns that are constant in the reference (a settled object's
                 height) would decide alone.
             few: what to do with fewer than k neighbours, `use` or `abstain`.
+            standardised: whether features are divided by their standard deviation.
         """
         self.k = k
         self.scale_floor = scale_floor
         self.few = few
+        self.standardised = standardised
 
     def check_params(self) -> None:
         """Check the ranges."""
         super().check_params()
-        if self.k < 1 or not self.scale_floor > 0:
-            raise ConfigError(
-                f"NearestNeighbours: expected k >= 1 and scale_floor > 0, found {self.k} and "
-                f"{self.scale_floor}"
-            )
+        _check_ranges(self)
 
     def fit(self, episodes: Sequence[Episode]) -> Self:
         """Learn the features of the reference."""
@@ -81,8 +97,7 @@ class NearestNeighbours(Scorer):
             raise EpisodeError(f"a reference episode cannot be used: {reason}") from None
         table = reference_features(rows, episodes, least=1)
         self.ids_ = tuple(e.id for e in episodes)
-        self.mean_ = table.mean(axis=0)
-        self.scale_ = np.maximum(table.std(axis=0), self.scale_floor)
+        self.mean_, self.scale_ = _scaling(table, self.scale_floor, self.standardised)
         self.table_ = (table - self.mean_) / self.scale_
         self.k_ = min(self.k, len(table))
         return self
@@ -99,3 +114,71 @@ class NearestNeighbours(Scorer):
             raise Abstain(f"only {len(others)} of {self.k} neighbours")
         distance = np.linalg.norm(others - (row - self.mean_) / self.scale_, axis=1)
         return -float(np.sort(distance)[: self.k].mean())
+
+
+class LabelFreeNearestNeighbours(PoolScorer):
+    """Negative mean distance to the k nearest episodes of the dataset that started elsewhere.
+
+    Features as those of `knn`, standardised by the episodes outside the fold of the start; an
+    episode has at least `min_others` neighbours to choose from, and k or all of them count.
+
+    Attributes:
+        mean_, scale_: (folds + 1, F) mean and standard deviation outside each fold, and of all.
+        table_: (n, F) features of the dataset.
+    """
+
+    resolution = 0.1
+
+    def __init__(
+        self,
+        *,
+        k: int = 5,
+        scale_floor: float = 2e-3,
+        standardised: bool = True,
+        same_start: float = 1e-3,
+        min_others: int = 5,
+    ) -> None:
+        """Store the parameters.
+
+        Args:
+            k: neighbours to average over.
+            scale_floor: smallest standard deviation that a feature is divided by.
+            standardised: whether features are divided by their standard deviation.
+            same_start: starts that differ by no more than this in any number are the same.
+            min_others: episodes of other starts that it takes to judge one.
+        """
+        self.k = k
+        self.scale_floor = scale_floor
+        self.standardised = standardised
+        self.same_start = same_start
+        self.min_others = min_others
+
+    def check_params(self) -> None:
+        """Check the ranges."""
+        super().check_params()
+        _check_ranges(self)
+
+    def _features(self, episode: Episode) -> Floats:
+        return _features(episode)
+
+    def _learn(self, features: Floats, fold: npt.NDArray[np.int64]) -> None:
+        scalings = [
+            _scaling(features[mask], self.scale_floor, self.standardised) for mask in outside(fold)
+        ]
+        self.mean_ = np.array([mean for mean, _ in scalings])
+        self.scale_ = np.array([scale for _, scale in scalings])
+        self.table_ = features
+
+    def _judge(self, features: Floats, model: int) -> float:
+        # The mean cancels: only the scale is left in the difference of two standardised rows.
+        others = self.table_[self.fold_ != model]  # the last model is no fold: all
+        distance = np.linalg.norm((others - features) / self.scale_[model], axis=1)
+        return -float(np.sort(distance)[: self.k].mean())
+
+
+def _check_ranges(scorer: NearestNeighbours | LabelFreeNearestNeighbours) -> None:
+    if scorer.k < 1 or not scorer.scale_floor > 0:
+        raise ConfigError(
+            f"{type(scorer).__name__}: expected k >= 1 and scale_floor > 0, found {scorer.k} and "
+            f"{scorer.scale_floor}"
+        )

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
     from curation_ros.core.episode import Episode
 
-Need = Literal["nothing", "reference", "object pose", "rollouts", "labels"]
+#: What orients a score; `dataset`: the unlabelled dataset itself, which only says what is usual.
+Need = Literal["nothing", "reference", "dataset", "object pose", "rollouts", "labels"]
 
 
 class Abstain(EpisodeError):  # noqa: N818 - an answer of a scorer rather than a fault

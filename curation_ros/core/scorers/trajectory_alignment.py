@@ -1,4 +1,4 @@
-"""Likeness of the motion to the reference's mean motion."""
+"""Likeness of the motion to the mean motion of others."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
-from curation_ros.core.errors import EpisodeError
+from curation_ros.core.errors import ConfigError, EpisodeError
 from curation_ros.core.scorers.features import (
     check_width,
     finite_state,
     moving_action,
     reference_features,
 )
+from curation_ros.core.scorers.pool import PoolScorer, outside
 from curation_ros.core.scorers.scorer import Abstain, Scorer
 
 if TYPE_CHECKING:
@@ -21,6 +23,18 @@ if TYPE_CHECKING:
 
     from curation_ros.core.episode import Episode
     from curation_ros.core.stream import Floats
+
+
+def _cosine(a: Floats, b: Floats) -> float:
+    norms = float(np.linalg.norm(a) * np.linalg.norm(b))
+    if not norms > 0:
+        raise Abstain("the state is zero throughout")
+    return float(np.clip(np.dot(a, b) / norms, -1.0, 1.0))
+
+
+def _moving_state(episode: Episode) -> Floats:
+    moving_action(episode)  # a frozen episode is to be looked at, not to be compared
+    return finite_state(episode)
 
 
 class TrajectoryAlignment(Scorer):
@@ -61,13 +75,66 @@ class TrajectoryAlignment(Scorer):
         states = self._trajectory(episode)
         check_width(states.shape[1], self.mean_.shape[1], "columns of the state")
         n_steps = min(len(states), len(self.mean_))
-        a, b = states[:n_steps].ravel(), self.mean_[:n_steps].ravel()
-        norms = float(np.linalg.norm(a) * np.linalg.norm(b))
-        if not norms > 0:
-            raise Abstain("the state is zero throughout")
-        return float(np.clip(np.dot(a, b) / norms, -1.0, 1.0))
+        return _cosine(states[:n_steps].ravel(), self.mean_[:n_steps].ravel())
 
     def _trajectory(self, episode: Episode) -> Floats:
-        moving_action(episode)  # a frozen episode is to be looked at, not to be compared
-        states = finite_state(episode)
+        states = _moving_state(episode)
         return states.mean(axis=0, keepdims=True) if self.of == "time-mean" else states
+
+
+class LabelFreeTrajectoryAlignment(PoolScorer):
+    """Cosine of the angle between an episode's states and the mean of all from other starts.
+
+    `of='time-mean'` as in `trajectory_alignment`; `of='flattened'` compares the states at
+    `n_points` evenly spaced steps, so that what is kept of an episode does not grow with it.
+
+    Attributes:
+        mean_: (folds + 1, F) mean outside each fold, and of all.
+    """
+
+    resolution = 0.001
+    choices: ClassVar = {"of": ("time-mean", "flattened")}
+
+    def __init__(
+        self,
+        *,
+        of: str = "time-mean",
+        n_points: int = 50,
+        same_start: float = 1e-3,
+        min_others: int = 5,
+    ) -> None:
+        """Store the parameters.
+
+        Args:
+            of: what is compared.
+            n_points: steps that are compared with `of='flattened'`.
+            same_start: starts that differ by no more than this in any number are the same.
+            min_others: episodes of other starts that it takes to judge one.
+        """
+        self.of = of
+        self.n_points = n_points
+        self.same_start = same_start
+        self.min_others = min_others
+
+    def check_params(self) -> None:
+        """Check the ranges."""
+        super().check_params()
+        if self.n_points < 2:
+            raise ConfigError(
+                f"LabelFreeTrajectoryAlignment: expected n_points >= 2, found {self.n_points}"
+            )
+
+    def _features(self, episode: Episode) -> Floats:
+        states = _moving_state(episode)
+        if self.of == "time-mean":
+            return np.asarray(states.mean(axis=0))
+        steps = np.rint(np.linspace(0, len(states) - 1, self.n_points)).astype(np.int64)
+        return states[steps].ravel()
+
+    def _learn(self, features: Floats, fold: npt.NDArray[np.int64]) -> None:
+        self.mean_ = np.array(
+            [features[m].mean(axis=0) if m.any() else 0 * features[0] for m in outside(fold)]
+        )
+
+    def _judge(self, features: Floats, model: int) -> float:
+        return _cosine(features, self.mean_[model])

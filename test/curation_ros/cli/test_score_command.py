@@ -13,7 +13,7 @@ import pytest
 from curation_ros.bags import find_bags, open_bag, read_episode
 from curation_ros.configuration import read_curation, read_reference
 from curation_ros.core.findings import FINDINGS
-from curation_ros.core.scorers import SCORERS
+from curation_ros.core.scorers import DEFAULT_SCORERS
 from curation_ros.dataset import Dataset
 
 DONE, FOUND, USAGE, NOTHING = 0, 1, 2, 3
@@ -150,7 +150,7 @@ def test_scorers_may_be_chosen_and_the_one_that_decides_is_added(
 
 def test_shipped_config_scores_without_a_reference(curation: Run, folder: Path) -> None:
     [row] = curation("score", _bag(folder), "--json").rows
-    assert list(row["scores"]) == list(SCORERS)
+    assert list(row["scores"]) == list(DEFAULT_SCORERS)
     assert row["decision"] == "review"
 
 

@@ -133,6 +133,16 @@ def make_reference(rng: np.random.Generator, n: int = 6) -> list[Episode]:
     ]
 
 
+def moved(episode: Episode, x_m: float) -> Episode:
+    """The same episode with its object moved along x: another start."""
+    return with_fields(episode, bowl_position=episode.fields["bowl_position"] + [x_m, 0.0, 0.0])
+
+
+def make_pool(rng: np.random.Generator, n: int = 8) -> list[Episode]:
+    """A dataset without labels: episodes that each have a start of their own."""
+    return [moved(e, 0.02 * k) for k, e in enumerate(make_reference(rng, n))]
+
+
 def shifted(episode: Episode, by_ns: int) -> Episode:
     """The same episode at another time."""
     return replace(

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import fields
+from dataclasses import fields, replace
+from typing import get_args
 
 import numpy as np
 import pytest
-from episodes import copied, make_episode, make_reference, shifted, with_fields
+from episodes import copied, make_episode, make_pool, moved, shifted, with_fields
 
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import EpisodeError, NotFittedError
-from curation_ros.core.scorers import SCORERS, Abstain, Scorer
+from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, Abstain, Need, PoolScorer, Scorer
 from curation_ros.core.scorers.ensemble import Ensemble
+from curation_ros.core.scorers.features import start_state
 from curation_ros.core.scorers.knn import NearestNeighbours
 
 NAMES = list(SCORERS)
+POOLED = [name for name in NAMES if SCORERS[name].needs == "dataset"]
 HOUR_NS = 3_600_000_000_000
 
 
@@ -26,7 +29,7 @@ def name(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def reference(rng: np.random.Generator) -> list[Episode]:
-    return make_reference(rng)
+    return make_pool(rng)
 
 
 @pytest.fixture
@@ -51,7 +54,8 @@ def test_construction_learns_nothing(name: str) -> None:
 
 
 def test_declares_what_it_needs(name: str) -> None:
-    assert SCORERS[name].needs in ("nothing", "reference", "object pose", "rollouts", "labels")
+    assert SCORERS[name].needs in get_args(Need)
+    assert issubclass(SCORERS[name], PoolScorer) == (SCORERS[name].needs == "dataset")
     assert SCORERS[name].resolution >= 0
     assert SCORERS[name]().resolution > 0
 
@@ -69,16 +73,17 @@ def test_score_before_fit_raises_where_a_reference_is_needed(
 
 def test_fit_returns_self_and_learned_values_are_plain(fitted: Scorer, name: str) -> None:
     scorer = SCORERS[name]()
-    assert scorer.fit([make_episode(np.random.default_rng(k)) for k in range(3)]) is scorer
+    assert scorer.fit(make_pool(np.random.default_rng(1), 6)) is scorer
     for value in fitted.fitted().values():
         assert isinstance(value, (np.ndarray, int, float, str, tuple, type(None)))
 
 
 def test_empty_reference_is_refused_where_one_is_needed(name: str) -> None:
     scorer = SCORERS[name]()
-    if scorer.needs == "reference":
-        with pytest.raises(EpisodeError, match="reference"):
+    if scorer.needs != "nothing":
+        with pytest.raises(EpisodeError, match=scorer.needs):
             scorer.fit([])
+        assert scorer.fitted() == {}
 
 
 def test_score_is_a_finite_float_and_changes_nothing(
@@ -110,7 +115,7 @@ def test_score_is_the_same_alone_and_in_a_batch(fitted: Scorer, rng: np.random.G
 
 
 def test_refit_forgets(name: str, reference: list[Episode], rng: np.random.Generator) -> None:
-    other = [make_episode(rng, 300, noise=0.2, close_at=60) for _ in range(4)]
+    other = [moved(make_episode(rng, 300, noise=0.2, close_at=60), 0.1 * k) for k in range(7)]
     fresh = SCORERS[name]().fit(reference)
     refitted = SCORERS[name]().fit(other).fit(reference)
     assert state_bytes(refitted) == state_bytes(fresh)
@@ -198,15 +203,15 @@ def test_another_robot_abstains_or_scores(fitted: Scorer, rng: np.random.Generat
         twist=np.tile(episode.fields["twist"], 2),
         eef_position=np.tile(episode.fields["eef_position"], 2),
     )
-    if fitted.needs == "reference":
-        with pytest.raises(Abstain, match="the reference has"):
+    if fitted.needs != "nothing":
+        with pytest.raises(Abstain, match=f"the {fitted.needs} has"):
             fitted.score(wider)
     else:
         assert np.isfinite(fitted.score(wider))
 
 
-def test_registry_is_the_paper_and_the_baseline() -> None:
-    assert set(NAMES) == {
+def test_registry_is_the_paper_the_baseline_and_the_twins() -> None:
+    paper = {
         "smoothness",
         "entropy",
         "gripper_timing",
@@ -214,8 +219,11 @@ def test_registry_is_the_paper_and_the_baseline() -> None:
         "ensemble",
         "knn",
         "trajectory_alignment",
-        "length",
     }
+    fitted_on_clean = {n for n in paper if SCORERS[n].needs == "reference"}
+    assert set(DEFAULT_SCORERS) == paper | {"length"}
+    assert set(POOLED) == {f"{n}_label_free" for n in fitted_on_clean}
+    assert set(NAMES) == set(DEFAULT_SCORERS) | set(POOLED)
     assert [n for n in NAMES if not SCORERS[n].length_controlled] == ["length"]
 
 
@@ -224,3 +232,118 @@ def test_other_forms_need_what_they_say(scorer: Scorer, rng: np.random.Generator
     assert scorer.needs == "reference"
     with pytest.raises(NotFittedError):
         scorer.score(make_episode(rng))
+
+
+# --- label-free twins ---------------------------------------------------------------------------
+
+
+def pooled(name: str, episodes: list[Episode]) -> PoolScorer:
+    scorer = SCORERS[name]()
+    assert isinstance(scorer, PoolScorer)
+    return scorer.fit(episodes)
+
+
+@pytest.mark.parametrize("name", POOLED)
+def test_copies_from_the_same_start_change_nothing(name: str, rng: np.random.Generator) -> None:
+    pool = make_pool(rng, 30)  # more starts than folds
+    for episode in (pool[0], pool[17]):
+        alone = pooled(name, pool)
+        copies = [copied(episode, id=i, name=i) for i in ("0", "a copy", "zzz")]
+        among = pooled(name, [copies[0], *pool, *copies[1:]])
+        without = pooled(name, [e for e in pool if e is not episode])
+        assert among.score(episode) == alone.score(episode)
+        assert among.score(copies[0]) == alone.score(episode)
+        if name != "isolation_forest_label_free":  # its trees draw other samples
+            assert without.score(pool[3]) != alone.score(pool[3])
+
+
+@pytest.mark.parametrize("name", POOLED)
+def test_repetitions_of_a_start_are_left_out_whatever_they_did(
+    name: str, rng: np.random.Generator
+) -> None:
+    pool = make_pool(rng, 8)
+    episode = pool[2]
+    wild = make_episode(rng, noise=0.5, open_at=120)
+    again = with_fields(
+        copied(wild, id="again"),
+        bowl_position=np.tile(episode.fields["bowl_position"][0], (240, 1)),
+    )
+    assert pooled(name, [*pool, again]).score(episode) == pooled(name, pool).score(episode)
+
+
+@pytest.mark.parametrize("name", POOLED)
+def test_order_of_the_dataset_changes_nothing(name: str, rng: np.random.Generator) -> None:
+    pool = make_pool(rng, 12)
+    backwards = pooled(name, pool[::-1])
+    renamed = pooled(name, [replace(e, id=f"{k}") for k, e in enumerate(pool)])
+    for episode in (*pool, moved(make_episode(rng), 1.0)):
+        expected = pooled(name, pool).score(episode)
+        assert backwards.score(episode) == expected
+        assert renamed.score(episode) == expected
+
+
+@pytest.mark.parametrize("name", POOLED)
+def test_fit_of_summaries_is_fit(name: str, rng: np.random.Generator) -> None:
+    pool = make_pool(rng)
+    scorer = SCORERS[name]()
+    assert isinstance(scorer, PoolScorer)
+    rows = [scorer.summary(e) for e in pool]
+    assert {row.shape for row in rows} == {rows[0].shape}
+    scorer.fit_summaries([e.id for e in pool], rows)
+    assert state_bytes(scorer) == state_bytes(pooled(name, pool))
+
+
+@pytest.mark.parametrize("name", POOLED)
+def test_episodes_that_cannot_be_used_are_skipped(name: str, rng: np.random.Generator) -> None:
+    pool = make_pool(rng)
+    episode = make_episode(rng)
+    foreign = with_fields(
+        episode,
+        twist=np.tile(episode.fields["twist"], 2),
+        eef_position=np.tile(episode.fields["eef_position"], 2),
+    )
+    bad = [degenerate("NaN"), make_episode(n_steps=1, episode_id="short"), foreign]
+    assert state_bytes(pooled(name, [*bad, *pool])) == state_bytes(pooled(name, pool))
+    with pytest.raises(EpisodeError, match="4 episodes that can be used, at least 5"):
+        pooled(name, [*bad, *pool[:4]])
+    with pytest.raises(EpisodeError, match=f"{pool[0].id} twice"):
+        pooled(name, [*pool, pool[0]])
+
+
+@pytest.mark.parametrize("name", POOLED)
+def test_too_few_other_starts_abstain_with_the_number(name: str, rng: np.random.Generator) -> None:
+    same = [moved(make_episode(rng, noise=0.0), 0.0) for _ in range(6)]
+    scorer = pooled(name, [*same, *make_pool(rng, 6)[3:]])
+    with pytest.raises(Abstain, match="only 3 episodes of other starts, at least 5"):
+        scorer.score(same[0])
+    assert np.isfinite(scorer.score(moved(make_episode(rng), 1.0)))
+    with pytest.raises(Abstain, match="only 0 episodes of other starts"):
+        pooled(name, same).score(same[0])
+
+
+@pytest.mark.parametrize("name", POOLED)
+def test_starts_are_the_same_within_the_tolerance(name: str, rng: np.random.Generator) -> None:
+    def bowl_at(x_m: float) -> Episode:
+        bowl = np.tile([x_m, 0.0, 0.9], (240, 1))
+        return with_fields(make_episode(rng), bowl_position=bowl)
+
+    pool = [bowl_at(x) for x in (0.0, 0.0009, 0.002, 0.1, 0.2, 0.3, 0.4, 0.5)]
+    scorer = pooled(name, pool)
+    groups = {x: k for x, k in zip(scorer.starts_[:, 0], scorer.fold_, strict=True)}
+    assert groups[0.0] == groups[0.0009]
+    assert len(set(groups.values())) == 7
+    with pytest.raises(Abstain, match="between starts"):
+        scorer.score(bowl_at(0.0015))
+
+
+def test_start_without_objects_is_that_of_the_effector(rng: np.random.Generator) -> None:
+    episode = make_episode(rng)
+    kept = {k: v for k, v in episode.topic_map.fields.items() if v.role != "object"}
+    state = ("eef_position", "finger_position")
+    bare = replace(episode, topic_map=replace(episode.topic_map, fields=kept, state=state))
+    np.testing.assert_array_equal(start_state(bare), episode.fields["eef_position"][0])
+    start = [episode.fields[name][0] for name in ("bowl_position", "plate_position")]
+    np.testing.assert_array_equal(start_state(episode), np.concatenate(start))
+    gone = with_fields(episode, bowl_position=np.full((240, 3), np.nan))
+    with pytest.raises(Abstain, match="start is not finite"):
+        start_state(gone)

@@ -173,16 +173,16 @@ def test_isolation_forest_equals_scikit_learn(n: int, rng: np.random.Generator) 
     others = [make_episode(rng, noise=x) for x in (0.0, 0.05, 0.3)]
     ours = IsolationForest(n_trees=30).fit(reference)
     theirs = SklearnForest(n_estimators=30, max_samples=min(256, n), random_state=0).fit(
-        np.array([_features(e) for e in reference])
+        np.array([_features(e, "signed") for e in reference])
     )
     for episode in (*others, *reference):
-        expected = theirs.score_samples(_features(episode)[None])[0]
+        expected = theirs.score_samples(_features(episode, "signed")[None])[0]
         assert ours.score(episode) == pytest.approx(expected, abs=ULPS)
 
 
 def test_isolation_forest_features_by_hand() -> None:
     # First action 0, 2: mean 1, std 1, max 2, min 0, rms sqrt(2); four dimensions.
-    features = _features(two_step_episode()).reshape(5, 4)[:, 0]
+    features = _features(two_step_episode(), "signed").reshape(5, 4)[:, 0]
     np.testing.assert_allclose(features, [1, 1, 2, 0, math.sqrt(2)])
 
 
