@@ -11,6 +11,7 @@ and `shared_decoder` keeps it for the next bag.
 from __future__ import annotations
 
 import copy
+import functools
 import struct
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -456,6 +457,20 @@ class CdrDecoder:
             known = _resolve_path(walk.type_name, definitions, path)
             self._paths[type_name, path] = known
         return known
+
+
+def shared_decoder(definitions: Mapping[str, str]) -> CdrDecoder:
+    """The decoder of this process for a set of definitions, with all the layouts it has learned.
+
+    Args:
+        definitions: as `CdrDecoder` takes them.
+    """
+    return _shared(frozenset(definitions.items()))
+
+
+@functools.lru_cache(maxsize=64)
+def _shared(definitions: frozenset[tuple[str, str]]) -> CdrDecoder:
+    return CdrDecoder(dict(definitions))
 
 
 class _Job:

@@ -35,6 +35,9 @@ from curation_ros.core.stream import Messages
 
 MAGIC = b"\x89MCAP0\r\n"
 
+#: Name of the metadata record that our writer adds when it finishes a bag.
+OWN_METADATA = "curation_ros"
+
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQI")
@@ -53,7 +56,10 @@ _MESSAGE_HEAD = np.dtype(
 )
 _ENTRY_BYTES = 16
 _FOOTER_BYTES = _RECORD.size + 20 + len(MAGIC)
-_MAX_CHUNK_BYTES = 1 << 30
+# The most that is held in memory of a chunk, and of any record; those of rosbag2 and of ours are
+# a few MB. And a chunk that unpacks to much more than it has is a trap: zeros pack 30,000 to 1.
+_MAX_CHUNK_BYTES = _MAX_RECORD_BYTES = 1 << 28
+_SMALL_CHUNK_BYTES, _MAX_COMPRESSION = 16 << 20, 1000
 # Files up to this size are read at once, and blocks of messages end after this much.
 _SMALL_BYTES = 4 << 20
 _BLOCK_BYTES = 16 << 20
@@ -84,17 +90,24 @@ _PARSERS: dict[int, Callable[[ReadDataStream], Record]] = {
     Opcode.METADATA: Metadata.read,
     Opcode.STATISTICS: Statistics.read,
 }
+_READ_WHOLE = frozenset({*_PARSERS, Opcode.CHUNK, Opcode.MESSAGE})
 
 
 class TornFileError(BagError):
     """The file begins as MCAP, but ends or is damaged before its end; `reason` says where."""
 
-    def __init__(self, path: Path, reason: str) -> None:
+    def __init__(self, path: Path, reason: str, finding: str = "malformed") -> None:
         super().__init__(
             f"{path} is truncated or damaged: {reason}; `ros2 run curation_ros recorder` recovers "
-            "what an interrupted recording has left, curation_ros.bags.recover_bag any file"
+            "what an interrupted recording has left, curation_ros.bags.recover_bag any file",
+            finding=finding,
         )
+        self.path = path
         self.reason = reason
+
+    def __reduce__(self) -> tuple[type[TornFileError], tuple[Path, str, str]]:
+        # Workers send it to their parent: without this it would be made of its message.
+        return type(self), (self.path, self.reason, self.finding)
 
 
 def open_mcap(path: Path) -> BinaryIO:
@@ -105,19 +118,26 @@ def open_mcap(path: Path) -> BinaryIO:
     """
     try:
         stream = path.open("rb")
+        start = stream.read(32)
     except OSError as err:
-        raise BagError(f"{path}: {err.strerror}") from err
-    start = stream.read(32)
+        gone = isinstance(err, FileNotFoundError)
+        finding = "missing-file" if gone else "unreadable"
+        raise BagError(f"{path}: {err.strerror}", finding=finding) from err
     if start.startswith(MAGIC):
         stream.seek(len(MAGIC))
         return stream
     stream.close()
     if not start:
-        raise BagError(f"{path} is empty (0 bytes): nothing was recorded in it")
+        raise BagError(
+            f"{path} is empty (0 bytes): nothing was recorded in it", finding="empty-file"
+        )
     for magic, what in _FOREIGN.items():
         if start.startswith(magic):
-            raise BagError(f"{path} is no MCAP file but {what}")
-    raise BagError(f"{path} is no MCAP file: it begins with {start[:8].hex()}, not {MAGIC.hex()}")
+            raise BagError(f"{path} is no MCAP file but {what}", finding="foreign-format")
+    raise BagError(
+        f"{path} is no MCAP file: it begins with {start[:8].hex()}, not {MAGIC.hex()}",
+        finding="not-mcap",
+    )
 
 
 def walk(
@@ -155,16 +175,25 @@ def _walk(
     while True:
         head = stream.read(_RECORD.size)
         if len(head) < _RECORD.size:
-            raise TornFileError(path, f"it ends at byte {size} without a footer")
+            raise TornFileError(path, f"it ends at byte {size} without a footer", "truncated")
         opcode, length = _RECORD.unpack(head)
         left = size - at - _RECORD.size
         if opcode == 0 or length > left:
             what = "zeros" if opcode == 0 else f"a record of {length} bytes, of which {left} exist"
-            raise TornFileError(path, f"at byte {at} there is {what}")
+            raise TornFileError(path, f"at byte {at} there is {what}", "truncated")
+        if length > _MAX_RECORD_BYTES and opcode in _READ_WHOLE:
+            raise TornFileError(
+                path,
+                f"the record at byte {at} has {length} bytes; {_MAX_RECORD_BYTES} are the most "
+                "that is read",
+                "too-large",
+            )
         if opcode == Opcode.FOOTER:
             stream.seek(at + _RECORD.size + length)
             if stream.read(len(MAGIC)) != MAGIC:
-                raise TornFileError(path, "the magic bytes after its footer are missing")
+                raise TornFileError(
+                    path, "the magic bytes after its footer are missing", "truncated"
+                )
             return
         if opcode == Opcode.CHUNK and not skip_chunk(at):
             yield from _chunk_records(
@@ -238,8 +267,8 @@ def _zstd() -> zstandard.ZstdDecompressor:
 
 
 def _chunk_data(path: Path, at: int, body: bytes) -> bytes:
-    def torn(what: str) -> TornFileError:
-        return TornFileError(path, f"the chunk at byte {at} {what}")
+    def torn(what: str, finding: str = "malformed") -> TornFileError:
+        return TornFileError(path, f"the chunk at byte {at} {what}", finding)
 
     try:
         _, _, size, checksum = _CHUNK.unpack_from(body)
@@ -249,7 +278,11 @@ def _chunk_data(path: Path, at: int, body: bytes) -> bytes:
     except (McapError, struct.error, ValueError, OverflowError) as err:
         raise torn("is malformed") from err
     if size > _MAX_CHUNK_BYTES:
-        raise torn(f"claims {size} bytes; {_MAX_CHUNK_BYTES} are the most that is read")
+        text = f"claims {size} bytes; {_MAX_CHUNK_BYTES} are the most that is read"
+        raise torn(text, "too-large")
+    if size > max(_SMALL_CHUNK_BYTES, _MAX_COMPRESSION * len(packed)):
+        text = f"claims {size} bytes in {len(packed)}: no recording is as empty as that"
+        raise torn(text, "too-large")
     try:
         if compression == "zstd":
             # -1: the frame does not say.
@@ -260,13 +293,17 @@ def _chunk_data(path: Path, at: int, body: bytes) -> bytes:
             # Never more than claimed, whatever the frame unpacks to.
             data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size)
         elif compression:
-            raise BagError(f"{path}: chunk compression {compression!r} is none of zstd, lz4")
+            raise BagError(
+                f"{path}: chunk compression {compression!r} is none of zstd, lz4",
+                finding="unsupported-compression",
+            )
         else:
             data = packed
     except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError) as err:
         raise torn(f"cannot be decompressed ({compression})") from err
     if len(data) != size or (checksum and zlib.crc32(data) != checksum):
-        raise torn("has a wrong checksum or size")
+        finding = "checksum" if len(data) == size else "malformed"
+        raise torn("has a wrong checksum or size", finding)
     return bytes(data)
 
 
@@ -291,6 +328,7 @@ class McapInfo:
         start_ns, end_ns: first and last log time; 0 without messages.
         data_end: offset behind the last record that is not of the summary, where there is one.
         rosbag2: the last `rosbag2` metadata record, or None.
+        own: that of our writer, or None.
         chunks: its chunks in file order, where the file has an index of each.
     """
 
@@ -302,6 +340,7 @@ class McapInfo:
     end_ns: int = 0
     data_end: int = 0
     rosbag2: dict[str, str] | None = None
+    own: dict[str, str] | None = None
     chunks: list[ChunkPlace] = field(default_factory=list)
 
     @property
@@ -328,7 +367,8 @@ def read_info(path: Path) -> McapInfo:
     for record in walk(path):
         if isinstance(record, Message):
             if record.channel_id not in info.channels:
-                raise TornFileError(path, f"a message of the unknown channel {record.channel_id}")
+                text = f"a message of the unknown channel {record.channel_id}"
+                raise TornFileError(path, text, "unknown-channel")
             info.counts[record.channel_id] = info.counts.get(record.channel_id, 0) + 1
             time_ns = record.log_time_ns
             info.start_ns = time_ns if first else min(info.start_ns, time_ns)
@@ -347,6 +387,8 @@ def _note(info: McapInfo, record: Record) -> None:
         info.channels[record.id] = record
     elif isinstance(record, Metadata) and record.name == "rosbag2":
         info.rosbag2 = record.metadata
+    elif isinstance(record, Metadata) and record.name == OWN_METADATA:
+        info.own = record.metadata
 
 
 def _read_summary(path: Path, stream: BinaryIO) -> McapInfo | None:
@@ -361,11 +403,13 @@ def _read_summary(path: Path, stream: BinaryIO) -> McapInfo | None:
     footer = Footer.read(ReadDataStream(BytesIO(tail[_RECORD.size :])))
     if not len(MAGIC) <= footer.summary_start <= size - _FOOTER_BYTES:
         return None
+    if size - footer.summary_start > _MAX_RECORD_BYTES:  # reading on finds out what it is
+        return None
     stream.seek(footer.summary_start)
     summary = stream.read(size - _FOOTER_BYTES - footer.summary_start)
     checked = zlib.crc32(tail[: -len(MAGIC) - 4], zlib.crc32(summary))
     if footer.summary_crc not in (0, checked):
-        raise TornFileError(path, "its summary has a wrong checksum")
+        raise TornFileError(path, "its summary has a wrong checksum", "checksum")
     info, statistics, place = McapInfo(), None, 0
     metadata_at: list[int] = []
     is_plain = True
@@ -403,7 +447,8 @@ def _read_summary(path: Path, stream: BinaryIO) -> McapInfo | None:
         stream.seek(offset)
         head = stream.read(_RECORD.size)
         opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, 0)
-        if opcode not in (Opcode.HEADER, Opcode.METADATA) or length > size - offset:
+        known = opcode in (Opcode.HEADER, Opcode.METADATA)
+        if not known or length > min(size - offset, _MAX_RECORD_BYTES):
             raise TornFileError(path, f"its index points at byte {offset}, where no record is")
         _note(info, _parse(path, offset, opcode, stream.read(length)))
     return info
@@ -412,7 +457,7 @@ def _read_summary(path: Path, stream: BinaryIO) -> McapInfo | None:
 def _note_index(info: McapInfo, opcode: int, body: bytes, metadata_at: list[int]) -> None:
     if opcode == Opcode.METADATA_INDEX:
         index = MetadataIndex.read(ReadDataStream(BytesIO(body)))
-        if index.name == "rosbag2":
+        if index.name in ("rosbag2", OWN_METADATA):
             metadata_at.append(index.offset)
         return
     _, _, start, size, map_size = _CHUNK_INDEX.unpack_from(body)
@@ -492,7 +537,8 @@ def _message_indexes(path: Path, info: McapInfo, file: _File) -> list[dict[int, 
     for place in info.chunks:
         head = file.read(place.start, _RECORD.size)
         if (
-            len(head) < _RECORD.size
+            max(place.size, place.index_size) > _MAX_RECORD_BYTES
+            or len(head) < _RECORD.size
             or _RECORD.unpack(head) != (Opcode.CHUNK, place.size - _RECORD.size)
             or not _holds_no_message(path, file, at, place.start)
         ):
@@ -520,6 +566,8 @@ def _holds_no_message(path: Path, file: _File, at: int, stop: int) -> bool:
         if opcode in (0, Opcode.MESSAGE, Opcode.CHUNK, Opcode.FOOTER) or length > stop - body_at:
             return False
         if opcode in _PARSERS:
+            if length > _MAX_RECORD_BYTES:
+                return False
             _parse(path, at, opcode, file.read(body_at, length))
         at = body_at + length
     return at == stop

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
+import os
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from curation_ros.bags.cdr import CdrDecoder
+from curation_ros.bags.cdr import CdrDecoder, shared_decoder
 from curation_ros.bags.definitions import full_type_name, parse_definition
 from curation_ros.bags.mcap_file import (
     McapInfo,
@@ -25,6 +27,7 @@ from curation_ros.bags.mcap_file import (
     walk,
 )
 from curation_ros.bags.recovery import custom_data_of
+from curation_ros.bags.writer import own_metadata
 from curation_ros.bags.yaml_text import load_yaml
 from curation_ros.core.builder import EpisodeBuilder
 from curation_ros.core.episode import Episode
@@ -102,7 +105,7 @@ class Bag:
 
     def decoder(self) -> CdrDecoder:
         """A decoder that knows the definitions of this bag."""
-        return CdrDecoder(self.definitions)
+        return shared_decoder(self.definitions)
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """Messages in file order; chunks without a wanted topic are not unpacked.
@@ -116,7 +119,7 @@ class Bag:
         """
         for topic in topics or ():
             if topic in self.unreadable:
-                raise BagError(f"{self.path}: topic {topic}: {self.unreadable[topic]}")
+                raise _foreign(self.path, topic, self.unreadable[topic])
         wanted = self.topics if topics is None else set(topics) & set(self.topics)
         for path, info in zip(self.mcap_paths, self._infos, strict=True):
             names = {i: c.topic for i, c in info.channels.items() if c.topic in wanted}
@@ -157,18 +160,20 @@ class Bag:
                 if len(fitting) > 1:
                     raise BagError(
                         f"{self.path}: topic {topic!r} may be {' or '.join(sorted(fitting))}; "
-                        "write the whole name into the topic map"
+                        "write the whole name into the topic map",
+                        finding="ambiguous",
                     )
                 if not fitting:
                     continue
                 found[topic] = fitting[0]
             name = found[topic]
             if name in self.unreadable:
-                raise BagError(f"{self.path}: topic {name}: {self.unreadable[name]}")
+                raise _foreign(self.path, name, self.unreadable[name])
             if names[name] != type_name:
                 raise BagError(
                     f"{self.path}: topic {name} has type {names[name]}, the topic map expects "
-                    f"{type_name}"
+                    f"{type_name}",
+                    finding="wrong-type",
                 )
         return found
 
@@ -213,7 +218,8 @@ class Bag:
                     continue
                 raise BagError(
                     f"{self.path}: topic {topic!r}: {type_name} has no header; "
-                    "write 'stamp: source' into the topic map"
+                    "write 'stamp: source' into the topic map",
+                    finding="no-header",
                 )
         for path, info in zip(self.mcap_paths, self._infos, strict=True):
             ids: dict[str, list[int]] = {name: [] for name in resolved.values()}
@@ -240,12 +246,14 @@ class Bag:
         if source_stamped:
             stamps_ns = block.publish_times_ns[rows]
             if (stamps_ns < 0).any():
-                raise BagError(f"{self.path}: topic {name}: a publish time is above 2**63 ns")
+                text = f"{self.path}: topic {name}: a publish time is above 2**63 ns"
+                raise BagError(text, finding="malformed")
         else:
             try:
                 stamps_ns = header_stamps_ns(messages)
             except EpisodeError as err:
-                raise BagError(f"{self.path}: topic {name}: {err}") from err
+                text = f"{self.path}: topic {name}: {err}"
+                raise BagError(text, finding="undecodable") from err
         return SampleBlock(topic, stamps_ns, block.sequences[rows], messages)
 
     def event(self) -> EpisodeEvent | None:
@@ -259,7 +267,7 @@ class Bag:
         try:
             return event_from_json(self._json("episode"))
         except EpisodeError as err:
-            raise BagError(f"{self.path}: {err}") from err
+            raise BagError(f"{self.path}: {err}", finding="bad-metadata") from err
 
     def topic_map(self) -> TopicMap | None:
         """The topic map that our recorder stored; None for a bag that is not ours.
@@ -270,9 +278,9 @@ class Bag:
         if "topic_map" not in self.custom_data:
             return None
         try:
-            return topic_map_from_json(self._json("topic_map"), f"{self.path}: its topic map")
+            return _stored_topic_map(self.custom_data["topic_map"])
         except ConfigError as err:
-            raise BagError(str(err)) from err
+            raise BagError(f"{self.path}: {err}", finding="bad-metadata") from err
 
     def _json(self, key: str) -> dict[str, Any]:
         text = self.custom_data.get(key, "{}")
@@ -282,9 +290,20 @@ class Bag:
             raw = None
         if not isinstance(raw, dict):
             raise BagError(
-                f"{self.path}: custom_data {key!r} is {text[:40]!r}, expected a JSON object"
+                f"{self.path}: custom_data {key!r} is {text[:40]!r}, expected a JSON object",
+                finding="bad-metadata",
             )
         return raw
+
+
+@functools.lru_cache(maxsize=64)
+def _stored_topic_map(text: str) -> TopicMap:
+    """The map that the bags of a dataset have in common."""
+    try:
+        raw = json.loads(text)
+    except ValueError as err:
+        raise ConfigError(f"its topic map is {text[:40]!r}, expected JSON") from err
+    return topic_map_from_json(raw, "its topic map")
 
 
 def open_bag(path: Path) -> Bag:
@@ -297,16 +316,11 @@ def open_bag(path: Path) -> Bag:
         BagError: if it is missing, truncated, of another storage or encoding, or compressed as a
             whole, saying which and what to do.
     """
-    custom_data: dict[str, str] | None = None
-    if path.is_dir():
-        metadata = _read_metadata_file(path)
-        mcap_paths = _listed_files(path, metadata) if metadata else _found_files(path)
-        if metadata is not None:
-            raw = metadata.get("custom_data") or {}
-            custom_data = {str(k): str(v) for k, v in raw.items()}
+    known = _open_own(path)
+    if known is not None:
+        mcap_paths, infos, custom_data = known
     else:
-        mcap_paths = (path,)
-    infos = tuple(_checked_info(p) for p in mcap_paths)
+        mcap_paths, infos, custom_data = _open_any(path)
     topics: dict[str, BagTopic] = {}
     unreadable: dict[str, str] = {}
     definitions: dict[str, str] = {}
@@ -314,10 +328,9 @@ def open_bag(path: Path) -> Bag:
         _collect_topics(file, info, topics, unreadable, definitions)
     if not topics and unreadable:
         name, reason = next(iter(unreadable.items()))
-        raise BagError(f"{path}: no topic can be read: {name}: {reason}")
-    if custom_data is None:
-        records = [info.rosbag2 for info in infos if info.rosbag2 is not None]
-        custom_data = custom_data_of(records[-1]) if records else {}
+        raise BagError(
+            f"{path}: no topic can be read: {name}: {reason}", finding="foreign-encoding"
+        )
     filled = [info for info in infos if info.counts]
     return Bag(
         path=path,
@@ -330,6 +343,53 @@ def open_bag(path: Path) -> Bag:
         end_ns=max((info.end_ns for info in filled), default=0),
         _infos=infos,
     )
+
+
+_Opened: TypeAlias = tuple[tuple[Path, ...], tuple[McapInfo, ...], dict[str, str]]
+
+
+def _open_own(folder: Path) -> _Opened | None:
+    """Open a folder as our writer left it, without parsing YAML; None where it is anything else."""
+    try:
+        content = (folder / "metadata.yaml").read_bytes()
+        [file] = [entry.path for entry in os.scandir(folder) if entry.name.endswith(".mcap")]
+        info = _checked_info(Path(file))
+    except (OSError, ValueError, BagError):
+        return None  # whatever is wrong, reading it as a foreign bag says so
+    custom_data = _own_custom_data(info)
+    if custom_data is None or info.own is None:
+        return None
+    if info.own != own_metadata(custom_data, os.path.basename(file), content):
+        return None
+    return (Path(file),), (info,), custom_data
+
+
+def _own_custom_data(info: McapInfo) -> dict[str, str] | None:
+    """custom_data as our writer noted it in the file; None where it did not."""
+    try:
+        raw = json.loads((info.own or {}).get("custom_data", ""))
+    except ValueError:
+        return None
+    return {str(k): str(v) for k, v in raw.items()} if isinstance(raw, dict) else None
+
+
+def _open_any(path: Path) -> _Opened:
+    custom_data: dict[str, str] | None = None
+    if path.is_dir():
+        metadata = _read_metadata_file(path)
+        mcap_paths = _listed_files(path, metadata) if metadata else _found_files(path)
+        if metadata is not None:
+            raw = metadata.get("custom_data") or {}
+            custom_data = {str(k): str(v) for k, v in raw.items()}
+    else:
+        mcap_paths = (path,)
+    infos = tuple(_checked_info(p) for p in mcap_paths)
+    if custom_data is None:
+        custom_data = _own_custom_data(infos[-1])
+    if custom_data is None:
+        records = [info.rosbag2 for info in infos if info.rosbag2 is not None]
+        custom_data = custom_data_of(records[-1]) if records else {}
+    return mcap_paths, infos, custom_data
 
 
 def _read_metadata_file(folder: Path) -> dict[str, Any] | None:
@@ -354,12 +414,14 @@ def _listed_files(folder: Path, metadata: Mapping[str, Any]) -> tuple[Path, ...]
     if storage not in ("mcap", ""):
         raise BagError(
             f"{folder}: storage {storage!r} cannot be read, expected mcap; convert it with "
-            "rosbags-convert or `ros2 bag convert`"
+            "rosbags-convert or `ros2 bag convert`",
+            finding="foreign-format",
         )
     if metadata.get("compression_mode"):
         raise BagError(
             f"{folder}: compression mode {metadata['compression_mode']!r} cannot be read, "
-            "expected MCAP's own compression of chunks; convert it with rosbags-convert"
+            "expected MCAP's own compression of chunks; convert it with rosbags-convert",
+            finding="unsupported-compression",
         )
     listed = metadata.get("relative_file_paths")
     if not isinstance(listed, list) or not listed:
@@ -368,7 +430,10 @@ def _listed_files(folder: Path, metadata: Mapping[str, Any]) -> tuple[Path, ...]
     files = tuple(folder / Path(str(name)).name for name in listed)
     for file in files:
         if not file.is_file():
-            raise BagError(f"{folder}: metadata.yaml names {file.name}, which is not there")
+            raise BagError(
+                f"{folder}: metadata.yaml names {file.name}, which is not there",
+                finding="missing-file",
+            )
     return files
 
 
@@ -378,15 +443,22 @@ def _found_files(folder: Path) -> tuple[Path, ...]:
         return tuple(files)
     if files:
         raise BagError(
-            f"{folder} has {len(files)} .mcap files and no metadata.yaml: name one of them"
+            f"{folder} has {len(files)} .mcap files and no metadata.yaml: name one of them",
+            finding="ambiguous",
         )
-    for pattern, what in (
-        ("*.db3", "SQLite files (.db3)"),
-        ("*.zstd", "compressed files (.zstd)"),
+    for pattern, what, finding in (
+        ("*.db3", "SQLite files (.db3)", "foreign-format"),
+        ("*.zstd", "compressed files (.zstd)", "unsupported-compression"),
     ):
         if any(folder.glob(pattern)):
-            raise BagError(f"{folder} has {what}, expected .mcap; convert it with rosbags-convert")
-    raise BagError(f"{folder} is no bag: it has neither metadata.yaml nor an .mcap file")
+            raise BagError(
+                f"{folder} has {what}, expected .mcap; convert it with rosbags-convert",
+                finding=finding,
+            )
+    raise BagError(
+        f"{folder} is no bag: it has neither metadata.yaml nor an .mcap file",
+        finding="missing-file",
+    )
 
 
 def _is_split(folder: Path, files: Sequence[Path]) -> bool:
@@ -403,10 +475,16 @@ def _natural(path: Path) -> tuple[tuple[int, str], ...]:
     return tuple((int(p), "") if p.isdigit() and p.isascii() else (-1, p) for p in pieces)
 
 
+def _foreign(path: Path, topic: str, reason: str) -> BagError:
+    return BagError(f"{path}: topic {topic}: {reason}", finding="foreign-encoding")
+
+
 def _checked_info(path: Path) -> McapInfo:
     info = read_info(path)
     if info.profile not in ("ros2", ""):
-        raise BagError(f"{path}: MCAP profile {info.profile!r}, expected 'ros2'")
+        raise BagError(
+            f"{path}: MCAP profile {info.profile!r}, expected 'ros2'", finding="foreign-encoding"
+        )
     return info
 
 
@@ -430,7 +508,8 @@ def _collect_topics(
         known = topics.get(channel.topic)
         if known is not None and known.type != type_name:
             raise BagError(
-                f"{path}: topic {channel.topic} has two types, {known.type} and {type_name}"
+                f"{path}: topic {channel.topic} has two types, {known.type} and {type_name}",
+                finding="ambiguous",
             )
         count = info.counts.get(channel.id, 0) + (known.count if known is not None else 0)
         topics[channel.topic] = BagTopic(type_name, count)
@@ -439,10 +518,14 @@ def _collect_topics(
         if other != text and parse_definition(type_name, other) != parse_definition(
             type_name, text
         ):
-            raise BagError(f"{path}: there are two different definitions of {type_name}")
+            raise BagError(
+                f"{path}: there are two different definitions of {type_name}", finding="ambiguous"
+            )
     strange = set(info.counts) - set(info.channels)
     if strange:
-        raise TornFileError(path, f"messages of the unknown channel {min(strange)}")
+        raise TornFileError(
+            path, f"messages of the unknown channel {min(strange)}", "unknown-channel"
+        )
 
 
 def read_episode(path: Path, topic_map: TopicMap | None = None) -> Episode:
@@ -464,7 +547,10 @@ def episode_of(bag: Bag, topic_map: TopicMap | None = None) -> Episode:
     """Build the episode of a bag that is open; see `read_episode`."""
     topic_map = topic_map or bag.topic_map()
     if topic_map is None:
-        raise BagError(f"{bag.path} was not recorded by this package: give a topic map")
+        raise BagError(
+            f"{bag.path} was not recorded by this package: give a topic map",
+            finding="no-topic-map",
+        )
     blocks = list(bag.blocks(topic_map))
     clock = [b.stamps_ns for b in blocks if b.topic == topic_map.clock_topic]
     event = _event_of(bag, topic_map, np.concatenate([*clock, np.empty(0, dtype=np.int64)]))
@@ -502,7 +588,8 @@ def _event_of(bag: Bag, topic_map: TopicMap, clock: Stamps) -> EpisodeEvent:
         if not len(clock):
             raise BagError(
                 f"{bag.path}: no message of the clock topic {topic_map.clock_topic!r}; "
-                f"the bag has {', '.join(sorted(bag.topics)) or 'no topics'}"
+                f"the bag has {', '.join(sorted(bag.topics)) or 'no topics'}",
+                finding="no-clock",
             )
         start_ns = int(clock.min())
         episode_id = foreign_episode_id(bag.sha256, start_ns)
@@ -536,7 +623,8 @@ def find_bags(paths: Iterable[Path]) -> list[Path]:
         bags = _bags_in(path)
         if not bags:
             raise BagError(
-                f"{path} has no bag in it" if path.exists() else f"{path}: no such path"
+                f"{path} has no bag in it" if path.exists() else f"{path}: no such path",
+                finding="missing-file",
             )
         for bag in bags:
             found.setdefault(bag.resolve(), bag)

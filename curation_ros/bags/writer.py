@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -13,6 +15,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
 from curation_ros import __version__
+from curation_ros.bags.mcap_file import OWN_METADATA
 from curation_ros.bags.qos import QosProfile, qos_to_yaml
 from curation_ros.bags.schemas import MessageSchema, message_schema
 from curation_ros.bags.yaml_text import dump_yaml
@@ -246,11 +249,14 @@ class BagWriter:
         try:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._write_metadata_record()
+            metadata = dump_yaml({"rosbag2_bagfile_information": self._bag_metadata()}).encode()
+            own = own_metadata(self._custom_data, self.path.name, metadata)
+            self._mcap.add_metadata(OWN_METADATA, own)
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._file.sync()
             self._file.close()
             self._open = False
-            self._write_metadata_file()
+            self._write_metadata_file(metadata)
         except OSError as err:
             raise self._failed(err) from err
 
@@ -312,16 +318,35 @@ class BagWriter:
             "rosbag2", {"serialized_metadata": dump_yaml(self._bag_metadata())}
         )
 
-    def _write_metadata_file(self) -> None:
+    def _write_metadata_file(self, content: bytes) -> None:
         final = self.directory / "metadata.yaml"
         temporary = final.with_name("metadata.yaml.tmp")
-        text = dump_yaml({"rosbag2_bagfile_information": self._bag_metadata()})
         with temporary.open("wb") as file:
-            file.write(text.encode())
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(final)
         sync_folder(self.directory)
+
+
+def own_metadata(
+    custom_data: Mapping[str, str], file_name: str, metadata_file: bytes
+) -> dict[str, str]:
+    """What the record OWN_METADATA of a finished bag holds.
+
+    To parse the YAML of rosbag2 takes longer than to read an episode. So the record repeats what
+    we need of it, and is believed beside the metadata.yaml whose digest it names.
+
+    Args:
+        custom_data: of rosbag2's metadata.
+        file_name: of the bag's only .mcap file.
+        metadata_file: content of metadata.yaml.
+    """
+    return {
+        "custom_data": json.dumps(dict(custom_data)),
+        "file": file_name,
+        "metadata_sha256": hashlib.sha256(metadata_file).hexdigest(),
+    }
 
 
 def sync_folder(folder: Path) -> None:
