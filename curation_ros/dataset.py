@@ -8,13 +8,12 @@ the recording person) `truth.jsonl`.
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import json
 import os
 import sqlite3
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -26,35 +25,7 @@ from curation_ros.core.decisions import Decision, in_force
 from curation_ros.core.errors import BagError, CurationError, EpisodeError
 from curation_ros.core.identity import resolve_prefix
 from curation_ros.core.selection import Manifest
-
-_SCHEMA = """
-CREATE TABLE episodes (
-    id TEXT PRIMARY KEY, name TEXT NOT NULL, path TEXT NOT NULL, start_ns INTEGER NOT NULL,
-    end_ns INTEGER NOT NULL, event TEXT NOT NULL, source TEXT NOT NULL,
-    recovered INTEGER NOT NULL);
-CREATE TABLE decisions (
-    episode TEXT NOT NULL, revision INTEGER NOT NULL, verdict TEXT NOT NULL, reason TEXT NOT NULL,
-    by TEXT NOT NULL, state_hash TEXT NOT NULL, span_start INTEGER NOT NULL,
-    span_end INTEGER NOT NULL, PRIMARY KEY (episode, revision));
-CREATE TABLE scores (
-    episode TEXT NOT NULL, scorer TEXT NOT NULL, state_hash TEXT NOT NULL, value REAL,
-    abstained TEXT, PRIMARY KEY (episode, scorer, state_hash));
-CREATE TABLE selections (
-    name TEXT PRIMARY KEY, path TEXT NOT NULL, created_at TEXT NOT NULL, kept INTEGER NOT NULL,
-    total INTEGER NOT NULL);
-PRAGMA user_version = 1;
-"""
-_SCHEMA_VERSION = 1
-_TABLES = ("episodes", "decisions", "scores", "selections")
-_BUSY_TIMEOUT_S = 10.0
-
-
-#: File systems on which processes cannot share the memory that SQLite's WAL needs.
-_SHARED = {"9p", "beegfs", "ceph", "cifs", "fuse.sshfs", "gpfs", "lustre", "nfs", "nfs4", "smb3"}
-
-
-class _SpoiltIndexError(CurationError):
-    """The index is no database, or one of another version of ours."""
+from curation_ros.index import TABLES, Index, SpoiltIndexError
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -90,21 +61,6 @@ def _named_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as err:
         raise CurationError(f"{err.filename or path}: {err.strerror or err}") from err
-
-
-def _file_system(path: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
-    """Kind of the file system that a path without links is on; empty where that is unknown."""
-    found, depth = "", 0
-    try:
-        lines = mounts.read_text(errors="surrogateescape").splitlines()
-    except OSError:  # not Linux
-        return ""
-    for line in lines:
-        _, point, kind, *_ = line.split(" ")
-        at = Path(point.replace("\\040", " "))
-        if len(at.parts) >= depth and path.is_relative_to(at):  # of one place, the last mount
-            found, depth = kind, len(at.parts)
-    return found
 
 
 def _append_line(path: Path, record: Mapping[str, Any]) -> None:
@@ -194,7 +150,7 @@ class Dataset:
     def names(self) -> list[tuple[str, str]]:
         """(id, short name) of every episode, from bags and decision logs."""
         self.refresh()
-        with self._index() as db:
+        with self.index.transaction() as db:
             named = dict(db.execute("SELECT id, name FROM episodes"))
         for log in (self.path / "decisions").glob("*.jsonl"):
             lines = _read_lines(log)
@@ -264,7 +220,7 @@ class Dataset:
                 revisions = [d.revision for d in self.decisions(decision.episode)]
                 decision = replace(decision, revision=max(revisions, default=0) + 1)
             _append_line(log, decision.to_json())
-        with suppress(CurationError), self._index() as db:
+        with suppress(CurationError), self.index.transaction() as db:
             _index_decision(db, decision)
         return decision
 
@@ -299,47 +255,16 @@ class Dataset:
             if path.exists():
                 raise CurationError(f"selection {path} exists: choose another --name")
             write_atomically(path, text)
-        with suppress(CurationError), self._index() as db:
+        with suppress(CurationError), self.index.transaction() as db:
             _index_selection(db, manifest, path)
         return path
 
     # --- index ------------------------------------------------------------------------------
 
     @cached_property
-    def index_elsewhere(self) -> str:
-        """Why the index is not in the dataset but in the user's cache; empty if it is there."""
-        kind = _file_system(self.path.resolve())
-        if kind in _SHARED:
-            return f"the dataset is on a network file system ({kind})"
-        return "" if os.access(self.path, os.W_OK) else "the dataset cannot be written"
-
-    @property
-    def index_path(self) -> Path:
-        """Where the index lives."""
-        if not self.index_elsewhere:
-            return self.path / "index.sqlite"
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        key = hashlib.sha256(str(self.path.resolve()).encode()).hexdigest()[:16]
-        return cache / "curation_ros" / f"index-{key}.sqlite"
-
-    @contextmanager
-    def _index(self) -> Iterator[sqlite3.Connection]:
-        """One transaction on the index."""
-        path = self.index_path
-        try:
-            if not path.exists():
-                _create_index(path)
-            with closing(sqlite3.connect(path, timeout=_BUSY_TIMEOUT_S)) as db:
-                [version] = db.execute("PRAGMA user_version").fetchone()
-                if version != _SCHEMA_VERSION:
-                    raise sqlite3.DatabaseError(f"version {version}, not {_SCHEMA_VERSION}")
-                db.execute("PRAGMA synchronous=NORMAL")  # a cache may lose its last lines
-                with db:
-                    yield db
-        except (OSError, sqlite3.Error) as err:
-            # The classes below DatabaseError are about a statement or the moment.
-            kind = _SpoiltIndexError if type(err) is sqlite3.DatabaseError else CurationError
-            raise kind(f"index {path}: {err}; curation index --rebuild makes it anew") from err
+    def index(self) -> Index:
+        """Its index: a cache made from its files."""
+        return Index(self.path)
 
     def refresh(self) -> list[str]:
         """Bring the index up to date with bags that have come or gone.
@@ -349,14 +274,14 @@ class Dataset:
         """
         present = {p.name: p for p in self.bags()}
         try:
-            with self._index() as db:
+            with self.index.transaction() as db:
                 known = {row[0] for row in db.execute("SELECT id FROM episodes")}
-        except _SpoiltIndexError:
+        except SpoiltIndexError:
             return self.rebuild()
         rows, problems = _bag_rows({i: present[i] for i in sorted(set(present) - known)})
         gone = [(i,) for i in known - set(present)]
         if rows or gone:
-            with self._index() as db:
+            with self.index.transaction() as db:
                 db.executemany("DELETE FROM episodes WHERE id = ?", gone)
                 db.executemany(_INSERT_EPISODE, rows)
         return problems
@@ -378,8 +303,8 @@ class Dataset:
                 problems.append(f"selection {path}: {err}")
 
         def fill() -> None:
-            with self._index() as db:
-                for table in _TABLES:
+            with self.index.transaction() as db:
+                for table in TABLES:
                     db.execute(f"DELETE FROM {table}")
                 db.executemany(_INSERT_EPISODE, rows)
                 for decision in decisions:
@@ -389,39 +314,21 @@ class Dataset:
 
         try:
             fill()
-        except _SpoiltIndexError:
+        except SpoiltIndexError:
             # Only a file that is of no use to anybody is removed from under other processes.
-            with _named_errors(self.index_path):
-                self.index_path.unlink(missing_ok=True)
+            self.index.remove()
             fill()
         return problems
 
     def rows(self, query: str, parameters: tuple[object, ...] = ()) -> list[sqlite3.Row]:
-        """Read from the index (tables episodes, scores, decisions, selections).
+        """Read from the index (its tables stand in index.py).
 
         Raises:
             CurationError: if it is spoilt, or the query makes no sense.
         """
-        with self._index() as db:
+        with self.index.transaction() as db:
             db.row_factory = sqlite3.Row
             return list(db.execute(query, parameters))
-
-
-def _create_index(path: Path) -> None:
-    """Make an empty index; it appears whole, so that nobody ever opens half of one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_name(f".{path.name}.new")
-    with new.with_suffix(".lock").open("a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if path.exists():
-            return
-        # What an index that was deleted has left would be played into the new one.
-        for left in (new, *(Path(f"{p}{end}") for p in (new, path) for end in ("-wal", "-shm"))):
-            left.unlink(missing_ok=True)
-        with closing(sqlite3.connect(new)) as db:
-            db.execute("PRAGMA journal_mode=WAL")
-            db.executescript(_SCHEMA)
-        os.rename(new, path)
 
 
 _INSERT_EPISODE = "INSERT OR REPLACE INTO episodes VALUES (?,?,?,?,?,?,?,?)"
@@ -456,13 +363,23 @@ def _bag_row(bag: Bag, episode_id: str) -> tuple[object, ...]:
 
 def _index_decision(db: sqlite3.Connection, d: Decision) -> None:
     db.execute(
-        "INSERT OR REPLACE INTO decisions VALUES (?,?,?,?,?,?,?,?)",
-        (d.episode, d.revision, d.verdict, d.reason, d.by, d.state_hash, *d.span),
+        "INSERT OR REPLACE INTO decisions VALUES (?,?,?,?,?,?,?,?,?)",
+        (
+            d.episode,
+            d.revision,
+            d.verdict,
+            d.reason,
+            d.by,
+            d.state_hash,
+            *d.span,
+            str(d.evidence.get("content", "")),
+        ),
     )
+    scoring = str(d.evidence.get("scoring", ""))
     db.executemany(
         "INSERT OR REPLACE INTO scores VALUES (?,?,?,?,?)",
         [
-            (d.episode, scorer, d.state_hash, value, d.abstained.get(scorer))
+            (d.episode, scorer, scoring, value, d.abstained.get(scorer))
             for scorer, value in d.scores.items()
         ],
     )

@@ -24,8 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Refresh or rebuild, then list the episodes with the decisions in force."""
     dataset = Dataset(args.dataset)
-    if dataset.index_elsewhere:
-        warn(f"{dataset.index_elsewhere}: its index is {dataset.index_path}")
+    if dataset.index.elsewhere:
+        warn(f"{dataset.index.elsewhere}: its index is {dataset.index.path}")
     for problem in dataset.rebuild() if args.rebuild else dataset.refresh():
         warn(problem)
     decided = dataset.latest_decisions()

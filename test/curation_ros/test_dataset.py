@@ -19,7 +19,8 @@ from curation_ros.core.decisions import Decision
 from curation_ros.core.errors import CurationError, EpisodeError
 from curation_ros.core.identity import new_episode_id
 from curation_ros.core.selection import Entry, Manifest
-from curation_ros.dataset import Dataset, _file_system, write_atomically
+from curation_ros.dataset import Dataset, write_atomically
+from curation_ros.index import file_system
 
 TABLES = ("episodes", "decisions", "scores", "selections")
 ID = "0197aaaa-0000-7000-8000-000000000001"
@@ -336,7 +337,7 @@ def test_rebuilt_index_equals_the_one_that_grew(
     }
     assert dataset.rebuild() == []
     assert _tables(dataset) == grown
-    dataset.index_path.unlink()
+    dataset.index.path.unlink()
     assert dataset.rebuild() == []
     assert _tables(dataset) == grown
 
@@ -404,7 +405,7 @@ def test_spoilt_index_is_made_anew(dataset: Dataset, rng: np.random.Generator) -
     _filled(dataset, rng)
     dataset.refresh()
     grown = _tables(dataset)
-    dataset.index_path.write_bytes(b"this is no database at all" * 100)
+    dataset.index.path.write_bytes(b"this is no database at all" * 100)
     with pytest.raises(CurationError, match="--rebuild"):
         dataset.rows("SELECT * FROM episodes")
     dataset.append_decision(_decision())  # the log is the truth: it does not need the index
@@ -426,16 +427,16 @@ def test_processes_that_index_at_once_agree(
 ) -> None:
     ids = sorted(_filled(dataset, rng))
     for _ in range(4):
-        dataset.index_path.unlink(missing_ok=True)
+        dataset.index.path.unlink(missing_ok=True)
         _at_once(_refresh, [(dataset.path, rebuild)] * 4)
         assert [r["id"] for r in dataset.rows("SELECT id FROM episodes ORDER BY id")] == ids
-        with sqlite3.connect(dataset.index_path) as db:
+        with sqlite3.connect(dataset.index.path) as db:
             assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
 
 
 def test_slow_reader_of_the_index_holds_up_no_decision(dataset: Dataset) -> None:
     dataset.refresh()
-    with sqlite3.connect(dataset.index_path) as reader:
+    with sqlite3.connect(dataset.index.path) as reader:
         reader.execute("BEGIN")
         reader.execute("SELECT * FROM episodes").fetchall()
         assert dataset.append_decision(_decision()).revision == 1
@@ -469,13 +470,13 @@ overlay /data overlay rw 0 0
 )
 def test_file_system_is_that_of_the_nearest_mount(tmp_path: Path, path: str, kind: str) -> None:
     (tmp_path / "mounts").write_text(_MOUNTS.strip() + "\n")
-    assert _file_system(Path(path), tmp_path / "mounts") == kind
-    assert _file_system(Path(path), tmp_path / "none") == ""
+    assert file_system(Path(path), tmp_path / "mounts") == kind
+    assert file_system(Path(path), tmp_path / "none") == ""
 
 
 def test_index_of_a_local_dataset_is_in_it(dataset: Dataset) -> None:
-    assert dataset.index_elsewhere == ""
-    assert dataset.index_path == dataset.path / "index.sqlite"
+    assert dataset.index.elsewhere == ""
+    assert dataset.index.path == dataset.path / "index.sqlite"
 
 
 _ON_READ_ONLY_DISK = """
@@ -484,8 +485,8 @@ from curation_ros.core.decisions import Decision
 from curation_ros.core.errors import CurationError
 from curation_ros.dataset import Dataset
 dataset = Dataset(sys.argv[1])
-print(dataset.index_path)
-print(dataset.index_elsewhere)
+print(dataset.index.path)
+print(dataset.index.elsewhere)
 print(len(dataset.names()), dataset.rebuild())
 decision = Decision(episode="x", name="n", verdict="keep", reason="r", span=(0, 1))
 for write in (lambda: dataset.append_decision(decision), lambda: dataset.append_truth({})):

@@ -50,9 +50,9 @@ def test_undecided_episodes_are_listed_as_such(curation: Run, folder: Path) -> N
 def test_rebuilt_index_says_the_same(curation: Run, folder: Path) -> None:
     data = folder / "data"
     before = curation("index", data, "--json")
-    Dataset(data).index_path.write_bytes(b"spoilt")
+    Dataset(data).index.path.write_bytes(b"spoilt")
     assert curation("index", data, "--rebuild", "--json").rows == before.rows
-    Dataset(data).index_path.write_bytes(b"spoilt again")
+    Dataset(data).index.path.write_bytes(b"spoilt again")
     assert curation("index", data, "--json").rows == before.rows
 
 
