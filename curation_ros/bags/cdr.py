@@ -29,7 +29,7 @@ from curation_ros.bags.definitions import (
 )
 from curation_ros.bags.schemas import message_schema
 from curation_ros.core.errors import ConfigError, EpisodeError
-from curation_ros.core.stream import Columns, Messages
+from curation_ros.core.stream import Columns, Messages, rows_at
 
 _HEADER_TYPE = "std_msgs/msg/Header"
 _TEXT_CODES = frozenset(TEXTS.values())
@@ -539,10 +539,7 @@ class _Job:
         buffer, starts = self._messages.buffer, self._messages.starts[rows]
         if int(starts.max()) + width > len(buffer):
             buffer = np.concatenate([buffer, np.zeros(width - length, dtype=np.uint8)])
-        # A view with a message at every byte: picking from it copies only those wanted.
-        places = np.ndarray((len(buffer) - width + 1,), f"V{width}", buffer, 0, (1,))
-        block: npt.NDArray[np.uint8] = places[starts].view(np.uint8).reshape(len(rows), width)
-        return block
+        return rows_at(buffer, starts, width)
 
     def _read_alike(
         self, layout: _Layout, block: npt.NDArray[np.uint8], rows: npt.NDArray[np.int64]

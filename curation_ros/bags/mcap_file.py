@@ -31,7 +31,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Footer, Header, Metadata, MetadataIndex, Schema, Statistics
 
 from curation_ros.core.errors import BagError
-from curation_ros.core.stream import Messages
+from curation_ros.core.stream import Messages, rows_at
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -658,10 +658,7 @@ def _split_by_index(
         return None
     order = np.argsort(offsets + base)
     at, stop, claimed = (offsets + base)[order], stop[order], claimed[order]
-    # A view of the buffer with a head at every byte: picking from it copies only those wanted.
-    n_places = len(buffer) - _MESSAGE_HEAD.itemsize + 1
-    places: npt.NDArray[np.void] = np.ndarray((n_places,), _MESSAGE_HEAD, buffer, 0, (1,))
-    heads = places[at]
+    heads = rows_at(buffer, at, _MESSAGE_HEAD.itemsize).view(_MESSAGE_HEAD)[:, 0]
     lengths, channels = heads["length"], heads["channel"]
     fits = (heads["opcode"] == Opcode.MESSAGE) & (channels == claimed)
     fits &= (lengths >= _MESSAGE.size) & (lengths <= stop - at - _RECORD.size)

@@ -349,7 +349,7 @@ _Opened: TypeAlias = tuple[tuple[Path, ...], tuple[McapInfo, ...], dict[str, str
 
 
 def _open_own(folder: Path) -> _Opened | None:
-    """Open a folder as our writer left it, without parsing YAML; None where it is anything else."""
+    """Open a folder as our writer left it, without parsing YAML; None for any other."""
     try:
         content = (folder / "metadata.yaml").read_bytes()
         [file] = [entry.path for entry in os.scandir(folder) if entry.name.endswith(".mcap")]

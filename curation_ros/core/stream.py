@@ -82,6 +82,21 @@ class Messages:
         return cls(buffer, np.cumsum(sizes) - sizes, sizes)
 
 
+def rows_at(buffer: npt.NDArray[np.uint8], starts: Stamps, size: int) -> npt.NDArray[np.uint8]:
+    """(n, size) bytes of a buffer from each start on.
+
+    Args:
+        buffer: (N,) contiguous.
+        starts: (n,) each between 0 and N - size.
+        size: number of bytes, at least 1.
+    """
+    # A view with a row at every byte: picking from it copies only the rows that are wanted.
+    places: npt.NDArray[np.void] = np.ndarray(
+        (len(buffer) - size + 1,), f"V{size}", buffer, 0, (1,)
+    )
+    return places[starts].view(np.uint8).reshape(len(starts), size)
+
+
 class SampleBlock(NamedTuple):
     """Samples of one topic in their order; its arrays have a value a message."""
 
@@ -148,10 +163,7 @@ def header_stamps_ns(messages: Messages) -> Stamps:
         header_stamp_ns(messages[int(short[0])])
     if not len(messages):
         return np.empty(0, dtype=np.int64)
-    # A view of the buffer with a head at every byte: picking from it copies only those wanted.
-    n_places = len(messages.buffer) - _STAMPED.itemsize + 1
-    places = np.ndarray((n_places,), _STAMPED, buffer=messages.buffer, strides=(1,))
-    heads = places[messages.starts]
+    heads = rows_at(messages.buffer, messages.starts, _STAMPED.itemsize).view(_STAMPED)[:, 0]
     sec, nanosec = heads["sec"], heads["nanosec"]
     big = heads["encoding"] & 1 == 0
     if big.any():
