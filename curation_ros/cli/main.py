@@ -15,6 +15,7 @@ from curation_ros.core.errors import ConfigError, CurationError
 #: that `curation score` needs no torch and `curation train` no ROS.
 COMMANDS = {
     "score": ("curation_ros.cli.score", "score bags and decide on them, without ROS"),
+    "audit": ("curation_ros.cli.audit", "how well scores tell good from bad, or only length"),
     "select": ("curation_ros.cli.select", "choose episodes and write a manifest"),
     "override": ("curation_ros.cli.override", "a person's decision on an episode"),
     "index": ("curation_ros.cli.index", "list a dataset; rebuild its index from its files"),

@@ -15,11 +15,9 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq
-from scipy.stats import rankdata, spearmanr
-from sklearn.metrics import roc_auc_score
 
 from curation_ros.core.errors import ConfigError
+from curation_ros.core.selection import mid_ranks
 from curation_ros.core.stream import Floats
 
 Flags: TypeAlias = npt.NDArray[np.bool_]
@@ -42,6 +40,11 @@ def _check(scores: Sequence[float] | Floats, good: Sequence[bool] | Flags) -> tu
     return values, flags
 
 
+def _ranks(values: Floats) -> Floats:
+    """(n,) mid-ranks from 1 for the lowest."""
+    return mid_ranks(-values)
+
+
 def auroc(scores: Sequence[float] | Floats, good: Sequence[bool] | Flags) -> float:
     """Probability that a good episode scores higher than a bad one; a tie counts half.
 
@@ -56,7 +59,7 @@ def auroc(scores: Sequence[float] | Floats, good: Sequence[bool] | Flags) -> flo
     """
     values, flags = _check(scores, good)
     n_good = int(flags.sum())
-    u = float(rankdata(values)[flags].sum()) - n_good * (n_good + 1) / 2
+    u = float(_ranks(values)[flags].sum()) - n_good * (n_good + 1) / 2
     return u / (n_good * (len(flags) - n_good))
 
 
@@ -90,6 +93,8 @@ def auroc_interval(
             f"AUROC {estimate!r} of {n_good!r} good and {n_bad!r} bad at {confidence!r}: expected "
             "an estimate from 0 to 1, positive numbers and a confidence between 0 and 1"
         )
+    from scipy.optimize import brentq  # takes a second: only who audits waits for it
+
     z = NormalDist().inv_cdf(0.5 + confidence / 2)
     others = (n_good + n_bad) / 2 - 1
 
@@ -172,6 +177,8 @@ def partial_auroc(
 
     Source: McClish, Med. Decis. Making 9:190-195, 1989, as scikit-learn computes it.
     """
+    from sklearn.metrics import roc_auc_score  # takes seconds: only who audits waits for it
+
     values, flags = _check(scores, good)
     return float(roc_auc_score(flags, values, max_fpr=max_fpr))
 
@@ -239,6 +246,8 @@ def rank_correlation(
     a, b = np.asarray(scores, dtype=np.float64), np.asarray(lengths, dtype=np.float64)
     if len(a) < 3 or np.ptp(a) == 0 or np.ptp(b) == 0:
         return None
+    from scipy.stats import spearmanr  # takes seconds: only who audits waits for it
+
     result = spearmanr(a, b)
     return float(result.statistic), float(result.pvalue)
 
@@ -308,7 +317,7 @@ def label_test_within(
         inside = groups == stratum
         n, n_good = int(inside.sum()), int(flags[inside].sum())
         if 0 < n_good < n:
-            parts.append((rankdata(values[inside]), flags[inside]))
+            parts.append((_ranks(values[inside]), flags[inside]))
             pairs += n_good * (n - n_good)
             least += n_good * (n_good + 1) / 2
     if not parts:
@@ -353,7 +362,7 @@ def correlation_test_within(
     for stratum in np.unique(groups):
         inside = groups == stratum
         if np.ptp(values[inside]) > 0 and np.ptp(sizes[inside]) > 0:
-            ranks = [rankdata(x[inside]) for x in (values, sizes)]
+            ranks = [_ranks(x[inside]) for x in (values, sizes)]
             parts.append((ranks[0] - ranks[0].mean(), ranks[1] - ranks[1].mean()))
     if not parts:
         return None
