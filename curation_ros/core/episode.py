@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +30,8 @@ class Episode:
         fields: name -> (T, D) float64; a phase is the index of its name in the map, -1 unknown.
         topic_map: the meaning of the fields.
         findings: faults of the recording, in a stable order.
+        sampled_hz: rate of the recording where the steps are a selection that no longer shows it
+            (length control); None where the stamps show it.
     """
 
     id: str
@@ -38,6 +42,11 @@ class Episode:
     fields: Mapping[str, Floats]
     topic_map: TopicMap
     findings: tuple[Finding, ...] = ()
+    sampled_hz: float | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What is cached is made again where it is needed: it must not travel to other processes.
+        return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def __len__(self) -> int:
         """Number of steps T."""
@@ -62,7 +71,9 @@ class Episode:
 
     @property
     def rate_hz(self) -> float:
-        """Median rate of the clock; NaN with fewer than two steps."""
+        """Rate of the recording, else median rate of the clock; NaN with fewer than two steps."""
+        if self.sampled_hz is not None:
+            return self.sampled_hz
         if len(self) < 2:
             return float("nan")
         return NS_PER_S / float(np.median(np.diff(self.stamps_ns)))
@@ -104,15 +115,15 @@ class Episode:
             parts.append(values)
         return np.concatenate(parts, axis=1)
 
-    @property
+    @cached_property
     def state(self) -> Floats:
-        """(T, S) state, as the topic map declares it."""
-        return self.columns(self.topic_map.state)
+        """(T, S) state, as the topic map declares it; read-only, as every scorer shares it."""
+        return _read_only(self.columns(self.topic_map.state))
 
-    @property
+    @cached_property
     def action(self) -> Floats:
-        """(T, A) action, as the topic map declares it."""
-        return self.columns(self.topic_map.action)
+        """(T, A) action, as the topic map declares it; read-only, as every scorer shares it."""
+        return _read_only(self.columns(self.topic_map.action))
 
     def steps(self, stop: int, start: int = 0) -> Episode:
         """The same episode with steps [start, stop) only; id, name and findings stay."""
@@ -160,3 +171,8 @@ class Episode:
             h.update(f"{name}{self.fields[name].shape}".encode())
             h.update(self.fields[name].astype("<f8").tobytes())
         return h.hexdigest()
+
+
+def _read_only(values: Floats) -> Floats:
+    values.setflags(write=False)
+    return values

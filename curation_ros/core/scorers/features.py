@@ -23,7 +23,13 @@ def _columns(episode: Episode, names: tuple[str, ...], what: str) -> Floats:
     missing = [n for n in names if n.partition("@")[0] not in episode.fields]
     if missing:
         raise Abstain(f"the {what} lacks the field {missing[0]!r}")
-    values = episode.columns(names)
+    topic_map = episode.topic_map
+    if names == topic_map.action:
+        values = episode.action  # made once for all scorers
+    elif names == topic_map.state:
+        values = episode.state
+    else:
+        values = episode.columns(names)
     if not np.isfinite(values).all():
         raise Abstain(f"the {what} has values that are not finite")
     return values

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -62,6 +63,29 @@ def test_state_and_action_are_the_columns_of_the_map() -> None:
     assert one_hot.sum(axis=1).tolist() == [1.0] * len(episode)
     np.testing.assert_array_equal(one_hot.argmax(axis=1), episode.field("phase")[:, 0])
     np.testing.assert_array_equal(episode.action[:, 3:], episode.field("gripper"))
+
+
+def test_state_and_action_are_made_once_shared_read_only_and_stay_at_home() -> None:
+    episode = make_episode()
+    assert episode.action is episode.action
+    assert episode.state is episode.state
+    with pytest.raises(ValueError, match="read-only"):
+        episode.action[0] = 0.0
+    fields = episode.fields["twist"]
+    fields[0] = 1.0  # what they were made of stays the owner's
+    sent = pickle.loads(pickle.dumps(episode))
+    assert "action" not in vars(sent)
+    assert sent.digest == episode.digest
+    np.testing.assert_array_equal(sent.action[0, :3], 1.0)
+    assert "action" not in vars(episode.steps(10))
+
+
+def test_rate_of_the_recording_wins_where_steps_were_selected() -> None:
+    episode = make_episode(rate_hz=20.0)
+    thinned = replace(episode.steps(100), sampled_hz=250.0)
+    assert thinned.rate_hz == 250.0
+    assert thinned.steps(50).rate_hz == 250.0
+    assert thinned.digest == episode.steps(100).digest
 
 
 def test_unknown_phase_is_no_column_of_the_one_hot() -> None:
@@ -130,4 +154,5 @@ def test_labels_have_no_place_in_an_episode() -> None:
     names = set(vars(make_episode(n_steps=30)))
     assert names == {
         "id", "name", "start_ns", "end_ns", "stamps_ns", "fields", "topic_map", "findings",
+        "sampled_hz",
     }  # fmt: skip
