@@ -5,7 +5,8 @@ and irregular messages use it directly. For the rest the walk is done once: mess
 length whose structural bytes (encapsulation, lengths, terminators, names that were looked up)
 equal those of a walked message have every value at the same place, so that NumPy can read the
 values of all of them as strided columns. What such a walk has found is kept for the next block,
-and `shared_decoder` keeps it for the next bag.
+and `shared_decoder` keeps it for the next bag. Where texts vary in length there are too many such
+layouts: then `cdr_columns` walks over all messages at once.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from curation_ros.bags.cdr_paths import Path, resolve_path
+from curation_ros.bags.cdr_columns import ColumnWalk
+from curation_ros.bags.cdr_paths import ValuePath, resolve_path
 from curation_ros.bags.cdr_walk import SIZES, Leaf, Walk, least_sizes
 from curation_ros.bags.definitions import TEXTS, Definitions, full_type_name, parse_definition
 from curation_ros.bags.schemas import message_schema
@@ -122,8 +124,9 @@ class CdrDecoder:
         """
         self._texts = {full_type_name(k): v for k, v in (definitions or {}).items()}
         self._walks: dict[str, tuple[Walk, Definitions]] = {}
-        self._paths: dict[tuple[str, str], Path] = {}
+        self._paths: dict[tuple[str, str], ValuePath] = {}
         self._layouts: dict[tuple[str, tuple[str, ...], int], list[_Layout]] = {}
+        self._n_layouts: dict[tuple[str, tuple[str, ...]], int] = {}
 
     def has_header(self, type_name: str) -> bool:
         """Whether the type begins with a std_msgs/Header.
@@ -200,20 +203,26 @@ class CdrDecoder:
         sizes = messages.sizes
         if not len(messages):
             return job.columns()
+        rows = np.arange(len(sizes))
+        key = (type_name, tuple(paths))
+        if min(len(rows), self._n_layouts.get(key, 0)) > _MAX_LAYOUTS:
+            rows = job.decode_together()
         if (sizes == sizes[0]).all():
-            groups = [np.arange(len(sizes))]
+            groups = [rows]
         else:
-            by_size = np.argsort(sizes, kind="stable")
+            by_size = rows[np.argsort(sizes[rows], kind="stable")]
             groups = np.split(by_size, np.flatnonzero(np.diff(sizes[by_size])) + 1)
-        for rows in groups:
-            length = int(sizes[rows[0]])
-            step = max(1, _BLOCK_BYTES // max(length, 1))
-            for start in range(0, len(rows), step):
-                job.decode(length, rows[start : start + step])
+        for group in groups:
+            if len(group):
+                length = int(sizes[group[0]])
+                step = max(1, _BLOCK_BYTES // max(length, 1))
+                for start in range(0, len(group), step):
+                    job.decode(length, group[start : start + step])
+        self._n_layouts[key] = self._n_layouts.get(key, 0) + job.n_learned
         return job.columns()
 
     def start(
-        self, type_name: str, paths: Sequence[Path], length: int
+        self, type_name: str, paths: Sequence[ValuePath], length: int
     ) -> tuple[Walk, list[_Layout]]:
         """A general walk of a type, and the layouts that messages of a length have had so far."""
         if len(self._layouts) > _MAX_CACHED:
@@ -233,7 +242,7 @@ class CdrDecoder:
             self._walks[type_name] = known
         return known
 
-    def _path(self, type_name: str, path: str) -> Path:
+    def _path(self, type_name: str, path: str) -> ValuePath:
         known = self._paths.get((type_name, path))
         if known is None:
             walk, definitions = self._walk(type_name)
@@ -260,7 +269,7 @@ class _Job:
     """One block of messages on its way to columns."""
 
     def __init__(
-        self, decoder: CdrDecoder, type_name: str, paths: Sequence[Path], messages: Messages
+        self, decoder: CdrDecoder, type_name: str, paths: Sequence[ValuePath], messages: Messages
     ) -> None:
         self._decoder = decoder
         self._type_name = type_name
@@ -272,6 +281,26 @@ class _Job:
             k: [] for k, path in enumerate(paths) if path.is_text
         }
         self._bad: dict[int, EpisodeError] = {}
+        self.n_learned = 0
+
+    def decode_together(self) -> npt.NDArray[np.int64]:
+        """Read all messages in one walk, and return the rows of those that it does not accept."""
+        walk, _ = self._decoder.start(self._type_name, self._paths, 0)
+        together = ColumnWalk(walk, self._messages)
+        try:
+            tree = together.run()
+            found = [together.find(tree, path) for path in self._paths]
+            texts = {k: together.texts(found[k]) for k in self._texts}
+        except IrregularError:
+            return np.arange(len(self._messages))
+        fits = together.fits
+        rows = np.flatnonzero(fits)
+        for column, leaves in enumerate(found):
+            if column in texts:
+                self._texts[column].append((rows, self._unicode(texts[column][fits], rows)))
+            else:
+                self._values[rows, column] = together.numbers(leaves)[fits]
+        return np.flatnonzero(~fits)
 
     def columns(self) -> Columns:
         return Columns(
@@ -311,6 +340,7 @@ class _Job:
             learned.append(layout)
             rows, block = self._read_alike(layout, block, rows)
         layouts[:] = [*learned, *layouts][:_MAX_LAYOUTS]
+        self.n_learned += len(learned)
         for row in rows.tolist():
             self._read_one(walk, row)
 

@@ -28,13 +28,20 @@ class Keyed(NamedTuple):
 Step: TypeAlias = str | int | Named | Keyed
 
 
-class Path(NamedTuple):
+class ValuePath(NamedTuple):
+    """A path as written, the steps that it means, and whether a text stands at its end."""
+
     text: str
     steps: tuple[Step, ...]
     is_text: bool
 
 
-def resolve_path(type_name: str, definitions: Definitions, path: str) -> Path:
+def resolve_path(type_name: str, definitions: Definitions, path: str) -> ValuePath:
+    """Check a path against a type.
+
+    Raises:
+        ConfigError: if the type has no such value, naming what it has.
+    """
     tokens = path.split(".")
     steps: list[Step] = []
     owner = type_name
@@ -63,15 +70,15 @@ def resolve_path(type_name: str, definitions: Definitions, path: str) -> Path:
                     raise wrong(f"{field.name!r} has at most {field.size} elements")
                 steps.append(index)
             elif names:
-                return Path(path, (*steps, Named(names, rest)), is_text=False)
+                return ValuePath(path, (*steps, Named(names, rest)), is_text=False)
             elif keyed:
-                return Path(path, (*steps, Keyed(rest)), is_text=keyed in TEXTS)
+                return ValuePath(path, (*steps, Keyed(rest)), is_text=keyed in TEXTS)
             else:
                 raise wrong(f"expected {' or '.join(hints)} after {field.name!r}, found {rest!r}")
         if not field.is_struct:
             if tokens:
                 raise wrong(f"{field.name!r} is a {field.base}, which has no {tokens[0]!r}")
-            return Path(path, tuple(steps), is_text=field.base in TEXTS)
+            return ValuePath(path, tuple(steps), is_text=field.base in TEXTS)
         owner = field.base
 
 

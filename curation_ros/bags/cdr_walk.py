@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from curation_ros.bags.cdr_paths import Keyed, Named, Path
+from curation_ros.bags.cdr_paths import Keyed, Named, ValuePath
 from curation_ros.bags.definitions import PRIMITIVES, TEXTS, Definitions, Field
 from curation_ros.core.errors import EpisodeError
 
@@ -28,11 +28,16 @@ Node: TypeAlias = Leaf | dict[str, Any] | list[Any]
 
 
 class Walk:
-    """Where every value of one message lies; bounds are checked before anything is trusted."""
+    """Where every value of one message lies; bounds are checked before anything is trusted.
+
+    Attributes:
+        type_name: of the messages.
+        definitions: of that type and all that it is made of.
+    """
 
     def __init__(self, type_name: str, definitions: Definitions, sizes: dict[str, int]) -> None:
         self.type_name = type_name
-        self._definitions = definitions
+        self.definitions = definitions
         self._sizes = sizes
 
     def run(self, data: bytes) -> dict[str, Any]:
@@ -68,7 +73,7 @@ class Walk:
         self._at += -(self._at - 4) % size
 
     def _members(self, type_name: str) -> dict[str, Any]:
-        fields = self._definitions[type_name]
+        fields = self.definitions[type_name]
         if not fields:
             # A message without members has one byte on the wire, as C structs must.
             self._require(1, 1, type_name)
@@ -160,7 +165,7 @@ class Walk:
             return {name: self.values(child) for name, child in node.items()}
         return [self.values(child) for child in node]
 
-    def find(self, tree: dict[str, Any], path: Path) -> Leaf:
+    def find(self, tree: dict[str, Any], path: ValuePath) -> Leaf:
         """The leaf that a path leads to; names that were looked up become structural."""
         node: Any = tree
         parent: dict[str, Any] = tree
@@ -189,7 +194,7 @@ class Walk:
         leaf: Leaf = node
         return leaf
 
-    def _lookup(self, names: Sequence[Leaf], wanted: str, path: Path) -> int:
+    def _lookup(self, names: Sequence[Leaf], wanted: str, path: ValuePath) -> int:
         texts = [self.data[leaf.at : leaf.at + leaf.length] for leaf in names]
         self.structure += [(leaf.at, leaf.at + leaf.length) for leaf in names]
         found = [i for i, text in enumerate(texts) if text == wanted.encode()]

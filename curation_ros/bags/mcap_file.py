@@ -63,6 +63,8 @@ _SMALL_CHUNK_BYTES, _MAX_COMPRESSION = 16 << 20, 1000
 # Files up to this size are read at once, and blocks of messages end after this much.
 _SMALL_BYTES = 4 << 20
 _BLOCK_BYTES = 16 << 20
+# Schemas and channels up to this size are kept, as the next bag is likely to have them, too.
+_COMMON_BYTES = 16 << 10
 _FOREIGN = {
     b"SQLite format 3": "a rosbag2 bag in SQLite (.db3); convert it with rosbags-convert",
     b"#ROSBAG V2.0": "a ROS 1 bag; convert it with rosbags-convert",
@@ -211,7 +213,7 @@ def _walk(
 
 def _parse(path: Path, at: int, opcode: int, body: bytes) -> Record:
     try:
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and len(body) < _SMALL_BYTES >> 8:
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and len(body) < _COMMON_BYTES:
             return _parsed_before(opcode, body)
         return _PARSERS[opcode](ReadDataStream(BytesIO(body)))
     except (McapError, struct.error, ValueError, OverflowError) as err:
@@ -250,6 +252,11 @@ def _chunk_records(
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             yield _parse(path, at, opcode, data[place : place + length])
         place += length
+
+
+# glibc returns memory to the system above a threshold, and then faults it in anew, page by page,
+# for every bag: half the time of reading one. Freeing a large block raises that threshold.
+np.empty(_SMALL_BYTES, dtype=np.uint8)
 
 
 class _PerThread(threading.local):
@@ -438,6 +445,8 @@ def _read_summary(path: Path, stream: BinaryIO) -> McapInfo | None:
     info.data_end = footer.summary_start
     info.counts = dict(statistics.channel_message_counts)
     if statistics.message_count != sum(info.counts.values()):
+        if info.counts:
+            raise TornFileError(path, "its statistics contradict themselves")
         return None
     info.start_ns, info.end_ns = statistics.message_start_time, statistics.message_end_time
     if statistics.metadata_count and not metadata_at:
@@ -497,7 +506,14 @@ def read_blocks(path: Path, info: McapInfo, channels: Collection[int]) -> Iterat
             file = _File(stream)
             indexes = _message_indexes(path, info, file)
             if indexes is None:
-                yield from _walked_blocks(walk(path, channels=channels))
+                n_left = sum(info.counts.get(channel, 0) for channel in channels)
+                for block in _walked_blocks(walk(path, channels=channels)):
+                    n_left -= len(block.messages)
+                    yield block
+                if n_left and info.data_end:
+                    raise TornFileError(
+                        path, "its statistics and its messages contradict each other"
+                    )
             else:
                 yield from _indexed_blocks(path, info, file, indexes, channels)
         except OSError as err:

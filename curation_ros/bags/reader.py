@@ -597,6 +597,9 @@ def _event_of(bag: Bag, topic_map: TopicMap, clock: Stamps) -> EpisodeEvent:
     if event.end_ns is None:  # the recorder died before it was said
         kind: EventKind = "aborted" if event.event == "aborted" else "ended"
         event = replace(event, event=kind, end_ns=max([event.start_ns, *clock.tolist()]))
+    if _UUID.fullmatch(bag.name) and bag.name != event.id and bag.event() is not None:
+        line = f"wrong-id: the folder {bag.name} has the bag of episode {event.id}"
+        event = replace(event, reason="\n".join(filter(None, [event.reason, line])))
     if bag.custom_data.get("recovered") == "true":
         tail = bag.custom_data.get("recovered_tail", "unknown")
         line = f"recovered: recovered after its recorder died; reading stopped: {tail}"
