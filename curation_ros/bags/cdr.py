@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from curation_ros.bags.cdr_columns import ColumnWalk
+from curation_ros.bags.cdr_columns import ColumnWalk, IrregularError
 from curation_ros.bags.cdr_paths import ValuePath, resolve_path
 from curation_ros.bags.cdr_walk import SIZES, Leaf, Walk, least_sizes
 from curation_ros.bags.definitions import TEXTS, Definitions, full_type_name, parse_definition
