@@ -107,7 +107,8 @@ def parse_definition(
             continue
         if name not in sections:
             if find is None:
-                raise BagError(f"definition of {type_name} has no section for {name}")
+                text = f"definition of {type_name} has no section for {name}"
+                raise BagError(text, finding="bad-definition")
             sections[name] = _SECTION.split(find(name))[0]
         found[name] = _parse_members(name, sections[name])
         pending += [field.base for field in found[name] if field.is_struct]
@@ -130,7 +131,8 @@ def _parse_members(type_name: str, text: str) -> tuple[Field, ...]:
             continue
         match = _LINE.fullmatch(line)
         if match is None:
-            raise BagError(f"definition of {type_name}: {line[:60]!r} is no member of a message")
+            text = f"definition of {type_name}: {line[:60]!r} is no member of a message"
+            raise BagError(text, finding="bad-definition")
         if match["rest"].startswith("="):
             continue  # a constant: not on the wire
         base = match["base"]
@@ -156,11 +158,13 @@ def _refuse_cycles(type_name: str, found: Definitions) -> None:
             done.add(name)
             continue
         if name in path:
-            raise BagError(f"definition of {type_name}: {name} contains itself")
+            text = f"definition of {type_name}: {name} contains itself"
+            raise BagError(text, finding="bad-definition")
         if name in done:
             continue
         if len(path) >= 64:
-            raise BagError(f"definition of {type_name}: nested deeper than 64 messages")
+            text = f"definition of {type_name}: nested deeper than 64 messages"
+            raise BagError(text, finding="bad-definition")
         path.append(name)
         stack.append((name, True))
         stack += [(field.base, False) for field in found[name] if field.is_struct]

@@ -39,7 +39,8 @@ def message_schema(type_name: str) -> MessageSchema:
     """
     parts = type_name.split("/")
     if len(parts) != 3 or parts[1] != "msg" or not all(p.isidentifier() for p in parts):
-        raise BagError(f"message type {type_name!r} is not of the form package/msg/Type")
+        text = f"message type {type_name!r} is not of the form package/msg/Type"
+        raise BagError(text, finding="bad-definition")
     installed = _installed_schema(type_name)
     return installed if installed is not None else _rosbags_schema(type_name)
 
@@ -110,12 +111,14 @@ def _rosbags_schema(type_name: str) -> MessageSchema:
         store = _typestore()
     except ImportError as err:
         raise BagError(
-            f"no definition of {type_name}: its ROS package is not installed, nor is rosbags"
+            f"no definition of {type_name}: its ROS package is not installed, nor is rosbags",
+            finding="bad-definition",
         ) from err
     if type_name not in store.fielddefs:
         raise BagError(
             f"no definition of {type_name}: its ROS package is not installed, and it is not among "
-            "the Jazzy types of rosbags"
+            "the Jazzy types of rosbags",
+            finding="bad-definition",
         )
     text = str(store.generate_msgdef(type_name, ros_version=2)[0])
     return MessageSchema(type_name, text, str(store.hash_rihs01(type_name)))
