@@ -100,6 +100,9 @@ class AuditSettings:
                 f"keep {self.keep!r}: expected a share from 0 to 1 with a point, or a number of "
                 "episodes"
             )
+        for name in ("n_permutations", "n_resamples"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} {getattr(self, name)}: expected at least 1")
         if self.length and self.length not in LENGTHS:
             raise ConfigError(f"length {self.length!r} is none of {', '.join(LENGTHS)}")
 

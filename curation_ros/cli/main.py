@@ -17,6 +17,7 @@ COMMANDS = {
     "score": ("curation_ros.cli.score", "score bags and decide on them, without ROS"),
     "audit": ("curation_ros.cli.audit", "how well scores tell good from bad, or only length"),
     "select": ("curation_ros.cli.select", "choose episodes and write a manifest"),
+    "export": ("curation_ros.cli.export", "write keep.json, CSV or Parquet"),
     "override": ("curation_ros.cli.override", "a person's decision on an episode"),
     "index": ("curation_ros.cli.index", "list a dataset; rebuild its index from its files"),
     "record": ("curation_ros.cli.record", "start and stop a recorder that is driven by hand"),

@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from episodes import make_episode
+from streams import record
+
+from curation_ros.bags import find_bags, open_bag
+from curation_ros.dataset import Dataset
+
+DONE, USAGE, NOTHING = 0, 2, 3
+EARLY = ("pick-2", "pick-3")
+KEYS = {
+    "scorer", "needs", "auroc_raw", "ci_raw", "auroc_controlled", "ci", "ci_starts", "pauroc",
+    "spearman_length", "spearman_length_p", "spearman_length_controlled",
+    "spearman_length_controlled_p", "auroc_within_length", "p_label_length_held",
+    "spearman_within_label", "p_length_label_held", "n_kept", "precision", "clean_recall",
+    "tied_at_cut", "purity_ceiling", "n_scored", "abstained", "abstained_raw", "paper", "notes",
+    "labels", "n_good", "n_bad", "unlabelled", "in_reference", "reference", "length_control",
+    "length_separates", "keep", "permutations", "seed",
+}  # fmt: skip
+Run = Callable[..., Any]
+
+
+@pytest.fixture
+def told_data(folder: Path) -> Path:
+    """The dataset with its truth: pick-2 and pick-3 are early releases that failed."""
+    dataset = Dataset(folder / "data")
+    for bag in find_bags([folder / "data"]):
+        event = open_bag(bag).event()
+        assert event is not None
+        early = event.name in EARLY
+        dataset.append_truth(
+            {
+                "episode": event.id,
+                "outcome": "failed" if early else "succeeded",
+                "defect": "early_release" if early else "none",
+            }
+        )
+    return folder / "data"
+
+
+def _fast(folder: Path) -> list[object]:
+    scorers = ["--scorers", "gripper_timing,knn", "--permutations", 99]
+    return [*scorers, "--reference", folder / "reference"]
+
+
+def test_json_is_a_line_a_scorer_with_exactly_the_keys(
+    curation: Run, folder: Path, told_data: Path
+) -> None:
+    told = curation("audit", told_data, *_fast(folder), "--json")
+    assert told.code == DONE, told.err
+    assert [r["scorer"] for r in told.rows] == ["length_path", "knn", "gripper_timing", "length"]
+    for row in told.rows:
+        assert set(row) == KEYS
+        assert list(row)[:2] == ["scorer", "needs"]
+    timing = told.rows[2]
+    assert timing["auroc_controlled"] == 1.0
+    assert (timing["labels"], timing["n_good"], timing["n_bad"]) == ("success", 3, 2)
+    assert timing["permutations"] == 99
+    assert timing["length_control"]["mode"] == "shortest-reference"
+    assert "NaN" not in told.out
+
+
+def test_table_shows_every_scorer_what_it_needs_and_the_paper(
+    curation: Run, folder: Path, told_data: Path
+) -> None:
+    told = curation("audit", told_data, *_fast(folder), "--labels", "defect")
+    assert told.code == DONE, told.err
+    text = " ".join(told.out.split())
+    assert "3 good and 2 bad by the label 'defect'; 5 reference episodes" in text
+    assert "needs reference" in text
+    assert "gripper timing nothing 1.000" in text
+    assert "Table I of the paper" in text
+    assert "0.957" in text
+    assert "99 permutations, seed 0" in text
+
+
+def test_not_identifiable_is_said_in_the_table_and_in_json(
+    curation: Run, dataset: Dataset, rng: np.random.Generator
+) -> None:
+    for n_steps, outcome in ((228, "succeeded"), (234, "succeeded"), (300, "failed")):
+        episode = make_episode(rng, n_steps)
+        record(dataset, episode)
+        dataset.append_truth({"episode": episode.id, "outcome": outcome})
+    options = ["--scorers", "gripper_timing", "--permutations", 9]
+    text = " ".join(curation("audit", dataset.path, *options).out.split())
+    assert "not identifiable: length alone separates the labels perfectly (good 228 to 234" in text
+    assert text.count("not identifiable") == 1 + 3  # and a cell in each row
+    for row in curation("audit", dataset.path, *options, "--json").rows:
+        assert (row["auroc_within_length"], row["p_label_length_held"]) == (None, None)
+        assert sum("not identifiable" in note for note in row["notes"]) == 2
+
+
+def test_same_call_prints_the_same(curation: Run, folder: Path, told_data: Path) -> None:
+    first = curation("audit", told_data, *_fast(folder), "--json")
+    assert curation("audit", told_data, *_fast(folder), "--json").out == first.out
+
+
+def test_unreadable_bag_is_told_and_the_others_are_audited(
+    curation: Run, folder: Path, told_data: Path
+) -> None:
+    broken = told_data / "episodes" / "broken"
+    broken.mkdir()
+    (broken / "broken_0.mcap").write_bytes(b"")
+    told = curation("audit", told_data, *_fast(folder), "--json")
+    assert told.code == DONE
+    assert told.rows[0]["n_good"] == 3
+    assert str(broken) in told.err
+
+
+def test_dataset_without_labels_is_nothing_to_audit(curation: Run, folder: Path) -> None:
+    told = curation("audit", folder / "data", *_fast(folder), "--json")
+    assert (told.code, told.out) == (NOTHING, "")
+    assert "5 have no such label in truth.jsonl" in told.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["--labels", "nose"], USAGE, "nose"),
+        (["--scorers", "nose"], USAGE, "no scorer 'nose'"),
+        (["--length", "nose"], USAGE, "length 'nose'"),
+        (["--length", "fixed:nose"], USAGE, "'nose' is no number"),
+        (["--length", "fixed"], USAGE, "takes steps"),
+        (["--keep", "nose"], USAGE, "--keep 'nose'"),
+        (["--keep", "0"], USAGE, "keep 0"),
+        (["--keep", "1.5"], USAGE, "keep 1.5"),
+        (["--permutations", "0"], USAGE, "n_permutations 0"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_a_code(
+    curation: Run, told_data: Path, arguments: list[str], code: int, said: str
+) -> None:
+    told = curation("audit", told_data, *arguments, "--json")
+    assert (told.code, told.out) == (code, "")
+    assert said in told.err
+    assert "fault of ours" not in told.err
+
+
+@pytest.mark.parametrize(
+    ("length", "mode", "steps", "needs"),
+    [
+        ("fixed:150", "fixed", 150, "nothing"),
+        ("percentile:50", "percentile", 240, "dataset"),
+        ("shortest-success", "shortest-success", 240, "labels"),
+        ("none", "none", None, "nothing"),
+    ],
+)
+def test_length_control_is_chosen_by_name_and_value(
+    curation: Run, told_data: Path, length: str, mode: str, steps: int | None, needs: str
+) -> None:
+    options = ["--scorers", "gripper_timing", "--permutations", 9, "--length", length]
+    told = curation("audit", told_data, *options, "--json")
+    control = told.rows[0]["length_control"]
+    assert (control["mode"], control["steps"], control["needs"]) == (mode, steps, needs)
+
+
+def test_number_to_keep_is_taken(curation: Run, told_data: Path) -> None:
+    options = ["--scorers", "gripper_timing", "--permutations", 9, "--json", "--keep"]
+    by_number = curation("audit", told_data, *options, "2").rows[0]
+    by_share = curation("audit", told_data, *options, "0.4").rows[0]
+    assert (by_number["n_kept"], by_share["n_kept"]) == (2, 2)
