@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -25,7 +25,8 @@ class Ensemble(Scorer):
     The paper adds raw scores: smoothness (about -10 to -1.5) and timing (0 to 1) are of different
     scales, so that with raw scores whichever varies more decides. `standardised=True` first
     subtracts the mean and divides by the standard deviation of each in the reference, which it
-    then needs. Abstains where either part does.
+    then needs. The choices of the parts are theirs: `rate_hz`, `gripper_channel` of smoothness,
+    `on` of gripper timing. Abstains where either part does.
 
     Attributes:
         mean_: (2,) mean of smoothness and timing in the reference; zeros if not standardised.
@@ -34,6 +35,7 @@ class Ensemble(Scorer):
 
     needs: Need = "nothing"
     resolution = 0.05
+    choices: ClassVar = {"on": GripperTiming.choices["on"]}
 
     def __init__(
         self,
@@ -41,15 +43,32 @@ class Ensemble(Scorer):
         smoothness_weight: float = 0.5,
         gripper_weight: float = 0.5,
         standardised: bool = False,
+        rate_hz: float = 0.0,
+        gripper_channel: bool = True,
+        on: str = "command",
     ) -> None:
-        """Store the weights, and whether the parts are standardised first."""
+        """Store the parameters.
+
+        Args:
+            smoothness_weight: weight of smoothness.
+            gripper_weight: weight of gripper timing.
+            standardised: whether the parts are standardised first.
+            rate_hz: sampling rate that smoothness assumes; 0: that of the episode.
+            gripper_channel: whether smoothness sees the command of the gripper.
+            on: what gripper timing reads.
+        """
         self.smoothness_weight = smoothness_weight
         self.gripper_weight = gripper_weight
         self.standardised = standardised
+        self.rate_hz = rate_hz
+        self.gripper_channel = gripper_channel
+        self.on = on
         self.needs = "reference" if standardised else "nothing"
 
     def check_params(self) -> None:
         """Check the ranges."""
+        super().check_params()
+        self._smoothness().check_params()
         weights = (self.smoothness_weight, self.gripper_weight)
         if not (np.isfinite(weights).all() and min(weights) >= 0 and sum(weights) > 0):
             raise ConfigError(
@@ -86,4 +105,8 @@ class Ensemble(Scorer):
         return float(np.dot((self.smoothness_weight, self.gripper_weight), parts))
 
     def _parts(self, episode: Episode) -> Floats:
-        return np.array([Smoothness().score(episode), GripperTiming().score(episode)])
+        timing = GripperTiming(on=self.on)
+        return np.array([self._smoothness().score(episode), timing.score(episode)])
+
+    def _smoothness(self) -> Smoothness:
+        return Smoothness(rate_hz=self.rate_hz, gripper_channel=self.gripper_channel)

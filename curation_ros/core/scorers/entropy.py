@@ -16,7 +16,8 @@ class Entropy(Scorer):
 
     The paper does not say over what: `over='dimensions'` averages the standard deviation over
     time of each action dimension, `over='values'` takes one of all numbers together. A binary
-    gripper dominates either; `gripper_channel=False` leaves it out.
+    gripper dominates either; `gripper_channel=False` leaves it out. The deviation is that of the
+    population (divided by T).
     """
 
     needs = "nothing"

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 class GripperTiming(Scorer):
     """Step of the first opening after a closing, over the number of steps (the paper's).
 
-    1.0 if it never opens again. `on='command'` reads the command, `on='fingers'` the measured
-    width (for hand-guided demonstrations without a command). Abstains if the gripper never
-    closed, and if the fingers contradict the sign that the topic map declares.
+    `on='command'` reads the command, `on='fingers'` the measured width (for hand-guided
+    demonstrations without a command). The paper does not say what an episode scores that never
+    opens again: `never='latest'` gives it 1.0, `never='abstain'` no score. Abstains if the gripper
+    never closed, and if the data contradict the meaning that the topic map declares.
 
     It needs no reference; one only completes its sentence for the operator.
 
@@ -35,11 +36,12 @@ class GripperTiming(Scorer):
 
     needs = "nothing"
     resolution = 0.05
-    choices: ClassVar = {"on": ("command", "fingers")}
+    choices: ClassVar = {"on": ("command", "fingers"), "never": ("latest", "abstain")}
 
-    def __init__(self, *, on: str = "command") -> None:
-        """Store what counts as an opening."""
+    def __init__(self, *, on: str = "command", never: str = "latest") -> None:
+        """Store what counts as an opening, and what one counts that never comes."""
         self.on = on
+        self.never = never
 
     def fit(self, episodes: Sequence[Episode]) -> Self:
         """Learn when the reference opens; scores do not change."""
@@ -59,6 +61,8 @@ class GripperTiming(Scorer):
     def score(self, episode: Episode) -> float:
         """From 0 (opened at once) to 1 (never opened again)."""
         step = self._opening(episode)
+        if step is None and self.never == "abstain":
+            raise Abstain("the gripper never opened again")
         return 1.0 if step is None else step / len(episode)
 
     def location(self, episode: Episode) -> tuple[int, int] | None:

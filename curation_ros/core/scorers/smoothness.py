@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -26,7 +26,7 @@ def spectral_arc_length(
     """Arc length of a speed profile's spectrum; 0 is smoothest, more negative is jerkier.
 
     Args:
-        speed: (T,) not negative, not all zero, T >= 2.
+        speed: (T,) not negative, not all zero, T >= 1.
         rate_hz: sampling rate of `speed`.
         cutoff_hz: frequencies above it are ignored; lowered to half the rate where it exceeds it.
         threshold: the band ends at the last frequency with this share of the largest amplitude.
@@ -40,7 +40,9 @@ def spectral_arc_length(
 
     Source: Balasubramanian, Melendez-Calderon, Burdet, IEEE TBME 59(8), 2012, with the adaptive
     cut-off of Balasubramanian et al., J. NeuroEngineering and Rehabilitation 12:112, 2015.
-    Differences: the cut-off is limited to half the rate.
+    Differences: the cut-off is limited to half the rate. The authors' own code (monalysa) takes
+    the whole FFT, so that with a cut-off above half the rate it goes on into the mirror image of
+    the spectrum; below that the two agree to rounding.
     """
     if not (np.isfinite(rate_hz) and rate_hz > 0):
         raise Abstain(f"the rate of the clock is {rate_hz} Hz")
@@ -61,42 +63,67 @@ def spectral_arc_length(
 class Smoothness(Scorer):
     """Spectral arc length of the norm of the action over time (the paper's 'smoothness').
 
-    The rate is the episode's own. With a binary gripper in the action its constant 1 dominates
-    the norm: the paper's definition, kept as the default; `gripper_channel=False` leaves it out.
+    The paper names neither rate, cut-off nor threshold: the rate is by default the episode's own,
+    the others are those of the authors of the measure. `rate_hz` gives one rate to all; at 1 Hz,
+    the default of the paper's released library, the cut-off never applies. The norm of an action is a speed
+    where actions are velocities; for commanded positions `profile='change'` takes the norm of
+    their differences. With a binary gripper in the action its constant 1 dominates the norm: the
+    paper's definition, kept as the default; `gripper_channel=False` leaves it out.
     """
 
     needs = "nothing"
     resolution = 0.05
+    choices: ClassVar = {"profile": ("norm", "change")}
 
     def __init__(
         self,
         *,
+        rate_hz: float = 0.0,
         cutoff_hz: float = 10.0,
         threshold: float = 0.05,
         pad_level: int = 4,
+        profile: str = "norm",
         gripper_channel: bool = True,
     ) -> None:
-        """Store the parameters of `spectral_arc_length`, and whether the gripper counts."""
+        """Store the parameters.
+
+        Args:
+            rate_hz: sampling rate that is assumed; 0: that of the episode.
+            cutoff_hz: frequencies above it are ignored.
+            threshold: the band ends at the last frequency with this share of the largest.
+            pad_level: doublings of the points of the spectrum.
+            profile: of what the spectrum is: `norm` of the action, or of its `change`.
+            gripper_channel: whether the command of the gripper is part of the action.
+        """
+        self.rate_hz = rate_hz
         self.cutoff_hz = cutoff_hz
         self.threshold = threshold
         self.pad_level = pad_level
+        self.profile = profile
         self.gripper_channel = gripper_channel
 
     def check_params(self) -> None:
         """Check the ranges."""
+        super().check_params()
         if not (self.cutoff_hz > 0 and 0 < self.threshold < 1 and self.pad_level >= 0):
             raise ConfigError(
                 "Smoothness: expected cutoff_hz > 0, 0 < threshold < 1 and pad_level >= 0, found "
                 f"{self.cutoff_hz}, {self.threshold} and {self.pad_level}"
+            )
+        if not (np.isfinite(self.rate_hz) and self.rate_hz >= 0):
+            raise ConfigError(
+                f"Smoothness: expected rate_hz > 0, or 0 for the episode's, found {self.rate_hz}"
             )
 
     def score(self, episode: Episode) -> float:
         """0 is smoothest, more negative is jerkier."""
         self.check_params()
         action = moving_action(episode, gripper_channel=self.gripper_channel)
+        if self.profile == "change":
+            action = np.diff(action, axis=0)
         return spectral_arc_length(
             np.linalg.norm(action, axis=1),
-            episode.rate_hz,
+            self.rate_hz or episode.rate_hz,
             cutoff_hz=self.cutoff_hz,
             threshold=self.threshold,
             pad_level=self.pad_level,
