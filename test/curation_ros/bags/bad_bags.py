@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+import uuid
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -71,8 +72,9 @@ class Bench:
             episode = self.episode
         if samples is None:
             samples = self.samples if episode is self.episode else samples_of(episode)
+        event = event or replace(ended(episode), counts={})
         data = {
-            "episode": json.dumps(event_to_json(event or replace(ended(episode), counts={}))),
+            "episode": json.dumps(event_to_json(replace(event, id=_id_of(path), name=path.name))),
             "topic_map": json.dumps(topic_map().to_json()),
             **(custom_data or {}),
         }
@@ -105,6 +107,11 @@ class Bench:
     def __init__(self, scratch: Path) -> None:
         """Make a bench with a folder of its own."""
         self.scratch = scratch
+
+
+def _id_of(path: Path) -> str:
+    """An id of its own for each bag."""
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, path.name))
 
 
 # --- samples ------------------------------------------------------------------------------------
@@ -265,7 +272,7 @@ def _event(**changes: Any) -> Callable[[Bench, Path], Path]:
     """A bag whose owner said something else; a key that is None is left out."""
 
     def make(bench: Bench, path: Path) -> Path:
-        said = event_to_json(ended(bench.episode)) | changes
+        said = event_to_json(replace(ended(bench.episode), id=_id_of(path))) | changes
         text = json.dumps({k: v for k, v in said.items() if v is not None})
         return bench.bag(path, custom_data={"episode": text})
 
@@ -804,15 +811,7 @@ BAD: dict[str, tuple[Make, str]] = {
     "early-release": (_made(open_at=CLOSE_AT + GRASP_STEPS + 20), "opened-early"),
     "stops-while-carrying": (_cut(0, _RELEASE_AT - 20), "unfinished"),
     "never-lets-go": (_made(open_at=None), "unfinished"),
-    "duplicate-of-another": (
-        lambda bench, path: bench.bag(
-            path,
-            episode=replace(
-                bench.episode, id="01a20ca5-731c-72b2-9789-75b85f70e62d", name="again"
-            ),
-        ),
-        "duplicate",
-    ),
+    "duplicate-of-another": (lambda bench, path: bench.bag(path), "duplicate"),
     # what the owner said
     "aborted": (_event(event="aborted", reason="a person pressed stop"), "aborted"),
     "lost-messages": (
