@@ -15,11 +15,12 @@ from curation_ros.core.decisions import CURATOR, Decision, in_force
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import CurationError, EpisodeError
 from curation_ros.core.gate import Closed, EpisodeGate
-from curation_ros.core.scoring import Curation
+from curation_ros.core.scoring import Curation, Ruling
 from curation_ros.core.status import EpisodeEvent, owner_findings
 from curation_ros.core.stream import Decoder, Sample
 from curation_ros.core.topic_map import TopicMap
 from curation_ros.dataset import Dataset
+from curation_ros.examining import EpisodesOf, Examiner, judge_bags, with_copy
 
 #: Verdicts that a person may give; to salvage needs a span, which only a scorer knows.
 OVERRIDES = ("keep", "discard", "review")
@@ -78,6 +79,7 @@ class LiveCuration:
             topic_map.topics, max_gap_s=topic_map.max_gap_s, drain_timeout_s=drain_timeout_s
         )
         self._decoder = decoder
+        self._scores = _known_scores(dataset, curation) if curation.rule_looks_at_dataset else {}
         self._live: dict[str, _Live] = {}
         self._seen: dict[str, Episode] = {}
         self._read: deque[str] = deque(maxlen=_REMEMBERED)
@@ -149,10 +151,21 @@ class LiveCuration:
         self._seen[episode.id] = episode
         while len(self._seen) > _REMEMBERED:
             del self._seen[next(iter(self._seen))]
-        decision = log_decision(
-            self.dataset, self.curation.decide(episode, revision=1, by=CURATOR)
-        )
+        decision = log_decision(self.dataset, self._judge(episode))
         return Decided(decision, time.perf_counter() - began)
+
+    def _judge(self, episode: Episode) -> Decision:
+        """The decision as far as it can be made now: a rule over the dataset sees it so far."""
+        seen = self.curation.examine(episode)
+        original = self.dataset.with_content(seen.content, other_than=seen.episode)
+        if original is not None and seen.steps:
+            seen = with_copy(seen, original)
+        ruling: Ruling | None = None
+        if self.curation.rule_looks_at_dataset:
+            if self.curation.is_trusted(seen):
+                self._scores[seen.episode] = seen.scores.get(self.curation.rule_scorer)
+            ruling = self.curation.ruling(self._scores, final=False, tie=self.dataset.tie(0))
+        return self.curation.judge(seen, ruling)
 
     def bag_closed(self, episode_id: str) -> list[Decided]:
         """Compare a closed bag with what was seen live; where they differ, the bag wins.
@@ -185,9 +198,24 @@ class LiveCuration:
         if known and found == "equal":
             self._amend(known[-1], {"bag": found})
             return None
-        decision = self.curation.decide(episode, revision=1, by=CURATOR)
+        decision = self._judge(episode)
         evidence = {**decision.evidence, "bag": found}
         return Decided(log_decision(self.dataset, replace(decision, evidence=evidence)))
+
+    def finish(self) -> list[Decision]:
+        """Decide on the whole dataset, finally, where the rule depends on all of it.
+
+        Returns:
+            The decisions in force that are new; none where each was final already.
+
+        Raises:
+            CurationError: while an episode runs: its samples would be lost.
+        """
+        if not self.curation.rule_looks_at_dataset:
+            return []
+        if self.running:
+            raise EpisodeError("an episode is running: decide on the whole dataset after it")
+        return decide_dataset(self.dataset, self.curation, self.topic_map)
 
     def override(self, prefix: str, verdict: str, reason: str, by: str) -> Decision:
         """Log a person's decision.
@@ -207,6 +235,50 @@ class LiveCuration:
         merged = {**decision.evidence, **evidence}
         if merged != decision.evidence:
             self.dataset.append_decision(replace(decision, evidence=merged), amend=True)
+
+
+def decide_dataset(
+    dataset: Dataset, curation: Curation, topic_map: TopicMap | None = None
+) -> list[Decision]:
+    """Decide on every bag of a dataset, with all of them in view, and log what is new.
+
+    Scorers that learn from the dataset learn from it anew; bags that cannot be read are left out.
+
+    Args:
+        dataset: its bags; what is in its index already is not read again.
+        curation: fitted on the reference.
+        topic_map: how episodes are built; None: by the map in each bag.
+
+    Returns:
+        The decisions in force that were not logged before.
+    """
+    bags = list(dataset.bags())
+    if curation.needs_dataset:
+        curation.fit_dataset(EpisodesOf(bags, topic_map))
+    new = []
+    judged = judge_bags(Examiner(curation, topic_map), curation, bags, tie=dataset.tie(0))
+    for _, decision in judged:
+        if decision is not None:
+            known = len(dataset.decisions(decision.episode))
+            logged = log_decision(dataset, decision)
+            if len(dataset.decisions(decision.episode)) > known:
+                new.append(logged)
+    return new
+
+
+def _known_scores(dataset: Dataset, curation: Curation) -> dict[str, float | None]:
+    """Deciding scores of the episodes that this curation's scorers have seen before."""
+    found = {}
+    for log in sorted((dataset.path / "decisions").glob("*.jsonl")):
+        own = [d for d in dataset.decisions(log.stem) if d.by == CURATOR]
+        last = in_force(own).get(log.stem)
+        if (
+            last is not None
+            and last.evidence.get("scoring") == curation.scoring_hash
+            and not decisions.untrustworthy(last.findings)
+        ):
+            found[log.stem] = last.scores.get(curation.rule_scorer)
+    return found
 
 
 def log_decision(dataset: Dataset, decision: Decision) -> Decision:

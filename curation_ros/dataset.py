@@ -24,7 +24,7 @@ from curation_ros.bags.writer import sync_folder
 from curation_ros.core.decisions import Decision, in_force
 from curation_ros.core.errors import BagError, CurationError, EpisodeError
 from curation_ros.core.identity import resolve_prefix
-from curation_ros.core.selection import Manifest
+from curation_ros.core.selection import Manifest, TieKey, tie_key
 from curation_ros.index import TABLES, Index, SpoiltIndexError
 
 
@@ -200,6 +200,15 @@ class Dataset:
             if "start" in t
         }
 
+    def tie(self, seed: int) -> TieKey:
+        """Episode id -> key that orders equal scores: a hash of its start, where that is noted."""
+        starts = self.start_of()
+
+        def key(episode_id: str) -> str:
+            return tie_key(seed, *starts.get(episode_id, (episode_id,)))
+
+        return key
+
     def append_decision(self, decision: Decision, *, amend: bool = False) -> Decision:
         """Log a decision under the next revision number, on disk when this returns.
 
@@ -223,6 +232,25 @@ class Dataset:
         with suppress(CurationError), self.index.transaction() as db:
             _index_decision(db, decision)
         return decision
+
+    def with_content(self, content: str, *, other_than: str) -> tuple[str, str] | None:
+        """An older episode (id, name) that was decided on and has the same content, if any.
+
+        Args:
+            content: `Episode.content_digest`.
+            other_than: id of the episode that is asked for; older ones have lower ids.
+        """
+        query = (
+            "SELECT d.episode, coalesce(e.name, '') FROM decisions d "
+            "LEFT JOIN episodes e ON e.id = d.episode "
+            "WHERE d.content = ? AND d.episode < ? ORDER BY d.episode LIMIT 1"
+        )
+        try:
+            with self.index.transaction() as db:
+                row = db.execute(query, (content, other_than)).fetchone()
+        except CurationError:  # a cache that cannot be used now costs no decision
+            return None
+        return (str(row[0]), str(row[1])) if row is not None else None
 
     # --- truth and selections ---------------------------------------------------------------
 

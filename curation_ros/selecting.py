@@ -10,7 +10,8 @@ from curation_ros.bags.reader import read_episode
 from curation_ros.core.decisions import CURATOR, Decision, in_force
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import ConfigError
-from curation_ros.core.selection import Candidate, Manifest, select, tie_key
+from curation_ros.core.scorers import SCORERS
+from curation_ros.core.selection import Candidate, Manifest, select
 from curation_ros.core.topic_map import TopicMap
 from curation_ros.dataset import Dataset
 
@@ -61,12 +62,10 @@ def save_selection(
             f"dataset {dataset.path}: no episode has a score of {scorer!r}: run "
             f"curation score {dataset.path} --write"
         )
-    starts = dataset.start_of()
-
-    def tie(episode_id: str) -> str:
-        return tie_key(seed, *starts.get(episode_id, (episode_id,)))
-
-    chosen = select(candidates, rule, value, seed=seed, tie=tie)
+    resolution = SCORERS[scorer]().resolution if scorer in SCORERS else 0.0
+    chosen = select(
+        candidates, rule, value, seed=seed, tie=dataset.tie(seed), resolution=resolution
+    )
     now = datetime.now(timezone.utc)
     hashes = {d.state_hash for d in (scored if ranks else decided).values() if d is not None}
     manifest = Manifest(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,20 +12,24 @@ from rich.progress import track
 from rich.table import Table
 from rich.text import Text
 
-from curation_ros.bags.reader import find_bags, read_episode
+from curation_ros.bags.reader import find_bags
 from curation_ros.cli.output import VERDICT_STYLE, console, print_json, progress_console, warn
 from curation_ros.configuration import read_curation, read_reference, share_file
 from curation_ros.core.decisions import Decision
-from curation_ros.core.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError
+from curation_ros.core.examination import Examination
+from curation_ros.core.rules import RULES
 from curation_ros.core.scorers import SCORERS
 from curation_ros.core.scoring import Curation
-from curation_ros.core.topic_map import TopicMap, read_topic_map
+from curation_ros.core.selection import TieKey
+from curation_ros.core.topic_map import read_topic_map
 from curation_ros.curating import log_decision
 from curation_ros.dataset import Dataset
+from curation_ros.examining import BACKENDS, EpisodesOf, Examined, Examiner, judge_bags
 
 _DONE, _FINDINGS, _NOTHING = 0, 1, 3
 _FIXED_WIDTH, _SCORE_WIDTH = 64, 12
+_FEW = 5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,7 +50,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scorers",
         help=f"comma separated, beside the one that decides: {', '.join(SCORERS)}",
     )
-    parser.add_argument("--rule", help="decision rule, where not that of the config")
+    parser.add_argument(
+        "--rule", help=f"decision rule, where not that of the config: {', '.join(RULES)}"
+    )
+    parser.add_argument("--rule-scorer", help="the scorer that decides, likewise")
+    parser.add_argument("--value", type=float, help="of --rule: a threshold, share or number")
     parser.add_argument(
         "--config", type=Path, help="scorers and rule; default config/curation.yaml"
     )
@@ -59,26 +67,57 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--check", action="store_true", help="exit with 1 where there are findings"
     )
+    parser.add_argument(
+        "--jobs", type=int, default=1, metavar="N", help="workers; -1 takes all cores"
+    )
+    parser.add_argument(
+        "--backend",
+        choices=BACKENDS,
+        default="loky",
+        help="of the workers: processes here, or a cluster (RAY_ADDRESS, DASK_SCHEDULER_ADDRESS)",
+    )
+    parser.add_argument(
+        "--fresh", action="store_true", help="score again what has been scored already"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Score everything that can be read; say what could not."""
-    config = args.config or share_file("config/curation.yaml")
-    names = [n.strip() for n in args.scorers.split(",")] if args.scorers else None
-    curation = read_curation(config, {"scorers": names, "rule": args.rule})
+    curation = _curation(args)
     topic_map = read_topic_map(args.topic_map) if args.topic_map else None
     dataset = _dataset(args) if args.write else None
     curation.fit(read_reference(args.reference, topic_map) if args.reference else [])
-    rows, flawed = [], False
-    for path, result in _score(args.paths, curation, topic_map, quiet=args.json):
-        if isinstance(result, CurationError):
-            flawed = True
-            if args.json:
-                print_json({"path": str(path), "error": str(result)})
-            else:
-                warn(result)
+    rows: list[dict[str, Any]] = []
+    n_read, n_known, n_bad = 0, 0, 0
+    flawed = False
+    bags, missing = _find(args.paths)
+    for path, problem in missing:
+        n_bad += 1
+        _report(args, path, problem)
+    if curation.needs_dataset:
+        curation.fit_dataset(EpisodesOf(bags, topic_map))
+    examiner = Examiner(
+        curation, topic_map, jobs=args.jobs, backend=args.backend, fresh=args.fresh
+    )
+
+    def bar(results: Iterable[Examined]) -> Iterable[Examined]:
+        return track(
+            results,
+            "scoring",
+            total=len(bags),
+            console=progress_console,
+            transient=True,
+            disable=len(bags) < _FEW or not progress_console.is_terminal,
+        )
+
+    judged = judge_bags(examiner, curation, bags, tie=_tie(dataset), progress=bar)
+    for one, decision in judged:
+        if decision is None or not isinstance(one.result, Examination):
+            n_bad += 1
+            _report(args, one.path, one.result)
             continue
-        episode, decision = result
+        n_read += 1
+        n_known += one.is_known
         if dataset is not None:
             # A person's decision stays in force, beside the scores and findings of now.
             decision = replace(
@@ -87,17 +126,60 @@ def run(args: argparse.Namespace) -> int:
                 findings=decision.findings,
             )
         flawed = flawed or bool(decision.findings)
-        row = decision_row(path, episode, decision)
-        rows.append(row)
+        row = decision_row(one.path, one.result, decision)
         if args.json:
             print_json(row)
+        else:
+            rows.append(row)
     if not args.json:
         for line in curation.describe().splitlines():
             progress_console.print(line, style="dim", markup=False)
         console.print(_table(rows, curation))
-    if not rows:
+    if examiner.problem:
+        warn(f"results could not be kept for the next time: {examiner.problem}")
+    if len(bags) >= _FEW and (progress_console.is_terminal or not args.json):
+        text = f"scored {n_read}, of which {n_known} were known; {n_bad} could not be read"
+        progress_console.print(text, style="dim", highlight=False)
+    if not n_read:
         return _NOTHING
-    return _FINDINGS if args.check and flawed else _DONE
+    return _FINDINGS if args.check and (flawed or n_bad) else _DONE
+
+
+def _curation(args: argparse.Namespace) -> Curation:
+    config = args.config or share_file("config/curation.yaml")
+    names = [n.strip() for n in args.scorers.split(",")] if args.scorers else None
+    settings: dict[str, Any] = {
+        "scorers": names,
+        "rule": args.rule,
+        "rule_scorer": args.rule_scorer,
+    }
+    if args.value is not None:
+        if args.rule is None:
+            raise ConfigError(f"--value {args.value:g} belongs to a --rule: name one")
+        key = "threshold" if args.rule == "threshold" else "value"
+        settings["rule_params"] = {key: args.value}
+    return read_curation(config, settings)
+
+
+def _find(paths: list[Path]) -> tuple[list[Path], list[tuple[Path, CurationError]]]:
+    """Bags that are meant, each once, and paths that lead to none."""
+    bags: dict[Path, Path] = {}
+    missing = []
+    for path in paths:
+        try:
+            for bag in find_bags([path]):
+                bags.setdefault(bag.resolve(), bag)
+        except CurationError as err:
+            missing.append((path, err))
+    return list(bags.values()), missing
+
+
+def _report(args: argparse.Namespace, path: Path, problem: object) -> None:
+    if args.json:
+        finding = getattr(problem, "finding", "")
+        print_json({"path": str(path), "error": str(problem), "finding": finding})
+    else:
+        warn(problem)
 
 
 def _dataset(args: argparse.Namespace) -> Dataset:
@@ -106,33 +188,17 @@ def _dataset(args: argparse.Namespace) -> Dataset:
     return Dataset(args.paths[0])
 
 
-def _score(
-    paths: list[Path], curation: Curation, topic_map: TopicMap | None, *, quiet: bool
-) -> Iterator[tuple[Path, tuple[Episode, Decision] | CurationError]]:
-    bags: list[Path] = []
-    for path in paths:
-        try:
-            bags += find_bags([path])
-        except CurationError as err:
-            yield path, err
-    shown = track(
-        bags, "scoring", console=progress_console, transient=True, disable=quiet or len(bags) < 5
-    )
-    for bag in shown:
-        try:
-            episode = read_episode(bag, topic_map)
-            yield bag, (episode, curation.decide(episode))
-        except CurationError as err:
-            yield bag, err
+def _tie(dataset: Dataset | None) -> TieKey | None:
+    return dataset.tie(0) if dataset is not None else None
 
 
-def decision_row(path: Path, episode: Episode, decision: Decision) -> dict[str, Any]:
+def decision_row(path: Path, seen: Examination, decision: Decision) -> dict[str, Any]:
     """The JSON of one scored episode."""
     return {
         "episode": decision.episode,
         "name": decision.name,
         "path": str(path),
-        "length": len(episode),
+        "length": seen.steps,
         "scores": dict(decision.scores),
         "decision": decision.verdict,
         "reason": decision.reason,

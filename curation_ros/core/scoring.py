@@ -296,6 +296,16 @@ class Curation:
             return self._ruling(None, str(err), basis, seen)
         return self._ruling(rule, "", basis, seen)
 
+    @property
+    def rule_looks_at_dataset(self) -> bool:
+        """Whether a decision depends on the scores of the other episodes."""
+        return RULES[self.rule].needs == "dataset"
+
+    @staticmethod
+    def is_trusted(seen: Examination) -> bool:
+        """Whether an episode counts for a rule over the dataset: its recording has no fault."""
+        return not untrustworthy(seen.findings)
+
     def _ruling(
         self,
         rule: Rule | None,

@@ -118,6 +118,8 @@ class Curator(Node):
 
     def _curate(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
+            for decision in self._live.finish():
+                self._publish(decision)
             manifest, path = save_selection(self._live.dataset, rule="decisions")
         except CurationError as err:
             response.message = str(err)

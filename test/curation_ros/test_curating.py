@@ -591,3 +591,108 @@ def test_removing_the_labels_changes_no_decision(dataset: Dataset) -> None:
     (dataset.path / "truth.jsonl").unlink()
     shutil.rmtree(dataset.path / "decisions")
     assert _curator(dataset).bag_closed(_good().id) == before
+
+
+# --- rules over the dataset ---------------------------------------------------------------------
+
+
+def _share(share: float = 0.5) -> Curation:
+    params = {"value": share}
+    reference = make_reference(np.random.default_rng(7))
+    return Curation(scorers=SCORERS, rule="top-fraction", rule_params=params).fit(reference)
+
+
+def _episodes(n: int, first: int = 100) -> list[Episode]:
+    """Each opens a little later than the one before."""
+    options = [{"open_at": 120 + 5 * k, "name": f"pick-{k}"} for k in range(n)]
+    return [
+        make_episode(
+            np.random.default_rng(first + k),
+            episode_id=f"00000000-0000-7000-8000-{k:012d}",
+            **o,  # type: ignore[arg-type]
+        )
+        for k, o in enumerate(options)
+    ]
+
+
+def test_rule_over_the_dataset_is_provisional_live_and_says_what_it_has_seen(
+    dataset: Dataset,
+) -> None:
+    live = _curator(dataset, _share())
+    told = [_watch(live, e, samples_of(e))[0].decision for e in _episodes(6)]
+    assert [d.verdict for d in told[:3]] == ["review"] * 3
+    assert told[2].reason == "only 3 episodes are scored so far; the rule needs 4"
+    # Each is better than all before it, so each is among the best half when it comes.
+    assert [d.verdict for d in told[3:]] == ["keep"] * 3
+    assert [d.evidence["basis"] for d in told] == ["provisional"] * 6
+    assert [d.evidence["fitted_on"]["episodes"] for d in told] == [1, 2, 3, 4, 5, 6]
+    assert len({d.state_hash for d in told}) == 6
+    assert len({d.evidence["scoring"] for d in told}) == 1
+
+
+def test_curator_that_starts_again_goes_on_with_what_was_scored(dataset: Dataset) -> None:
+    episodes = _episodes(5)
+    for episode in episodes[:4]:
+        _watch(_curator(dataset, _share()), episode, samples_of(episode))
+    [decided] = _watch(_curator(dataset, _share()), episodes[4], samples_of(episodes[4]))
+    assert decided.decision.evidence["fitted_on"]["episodes"] == 5
+    other = Curation(scorers=SCORERS, rule="top-fraction").fit([])  # scores of another state
+    [decided] = _watch(_curator(dataset, other), episodes[0], samples_of(episodes[0]))
+    assert decided.decision.evidence["fitted_on"]["episodes"] == 1
+
+
+def test_final_decisions_are_over_the_whole_dataset_whatever_came_first(dataset: Dataset) -> None:
+    live = _curator(dataset, _share())
+    episodes = _episodes(6)
+    for episode in episodes:
+        _watch(live, episode, samples_of(episode))
+        record(dataset, episode)
+        live.bag_closed(episode.id)
+    new = live.finish()
+    decided = dataset.latest_decisions()
+    assert [decided[e.id].verdict for e in episodes] == ["discard"] * 3 + ["keep"] * 3
+    assert {d.evidence["basis"] for d in decided.values()} == {"final"}
+    assert {d.evidence["fitted_on"]["episodes"] for d in decided.values()} == {6}
+    assert len({d.state_hash for d in decided.values()}) == 1
+    assert {d.episode for d in new} == {e.id for e in episodes}
+    assert live.finish() == []  # nothing new
+    manifest, _ = save_selection(dataset, rule="decisions")
+    assert {e.episode for e in manifest.entries} == {e.id for e in episodes[3:]}
+
+
+def test_finishing_waits_for_the_running_episode(dataset: Dataset) -> None:
+    live = _curator(dataset, _share())
+    live.event(started(_good()), 0.0)
+    with pytest.raises(EpisodeError, match="an episode is running"):
+        live.finish()
+
+
+def test_final_rule_leaves_a_person_s_decision_in_force(dataset: Dataset) -> None:
+    live = _curator(dataset, _share())
+    for episode in _episodes(6):
+        _watch(live, episode, samples_of(episode))
+        record(dataset, episode)
+    worst = _episodes(1)[0]
+    live.override(worst.id, "keep", "the only one from this side", "Ada")
+    live.finish()
+    assert dataset.latest_decisions()[worst.id].by == "Ada"
+
+
+def test_rule_on_the_reference_is_final_at_once(dataset: Dataset) -> None:
+    live = _curator(dataset)
+    [decided] = _watch(live, _good(), samples_of(_good()))
+    assert decided.decision.evidence["basis"] == "final"
+    assert decided.decision.evidence["fitted_on"]["what"] == "reference"
+    assert live.finish() == []
+
+
+def test_copy_that_is_played_live_is_found(dataset: Dataset) -> None:
+    live = _curator(dataset)
+    first = _episodes(1)[0]
+    _watch(live, first, samples_of(first))
+    copy = replace(first, id="00000000-0000-7000-8000-00000000ffff", name="copy")
+    [decided] = _watch(live, copy, samples_of(copy))
+    assert decided.decision.verdict == "review"
+    assert decided.decision.reason.startswith(f"duplicate: same content as {first.id[:8]}")
+    record(dataset, copy)
+    assert live.bag_closed(copy.id) == []  # equal to the bag, copy or not
