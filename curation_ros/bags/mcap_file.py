@@ -627,11 +627,9 @@ def _indexed_blocks(
 ) -> Iterator[MessageBlock]:
     wanted = frozenset(channels)
     missing = sum(info.counts.get(channel, 0) for channel in wanted)
-    skipped = False
     group: list[_Chunk] = []
     for place, entries in zip(info.chunks, indexes, strict=True):
         if not any(raw for channel, raw in entries.items() if channel in wanted):
-            skipped = True
             continue
         body = file.read(place.start + _RECORD.size, place.size - _RECORD.size)
         group.append(_Chunk(place.start, _chunk_data(path, place.start, body), entries))
@@ -644,7 +642,7 @@ def _indexed_blocks(
         block = _split(path, group, wanted)
         missing -= len(block.messages)
         yield block
-    if missing and skipped:
+    if missing:
         raise TornFileError(path, "its message indexes and its chunks contradict each other")
 
 
