@@ -20,6 +20,7 @@ COMMANDS = {
     "export": ("curation_ros.cli.export", "write keep.json, CSV or Parquet"),
     "override": ("curation_ros.cli.override", "a person's decision on an episode"),
     "index": ("curation_ros.cli.index", "list a dataset; rebuild its index from its files"),
+    "self-check": ("curation_ros.cli.self_check", "prove that no score depends on labels"),
     "record": ("curation_ros.cli.record", "start and stop a recorder that is driven by hand"),
     "train": ("curation_ros.cli.train", "train a policy on a selection"),
     "evaluate": ("curation_ros.cli.evaluate", "count a policy's successes over start states"),

@@ -1,0 +1,64 @@
+"""`curation self-check`: turn all labels over in a copy, and prove that no score changes."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from curation_ros.cli.output import print_json, say
+from curation_ros.configuration import read_curation, share_file
+from curation_ros.core.scorers import SCORERS
+from curation_ros.core.topic_map import read_topic_map
+from curation_ros.dataset import Dataset
+from curation_ros.self_checking import self_check
+
+_PROVEN, _DIFFERS = 0, 1
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument(
+        "--reference",
+        nargs="+",
+        action="extend",
+        type=Path,
+        default=[],
+        metavar="DIR",
+        help="trusted demonstrations: datasets or bags",
+    )
+    parser.add_argument(
+        "--config",
+        type=Path,
+        help="rule and parameters; default config/curation.yaml. All scorers are checked",
+    )
+    parser.add_argument(
+        "--topic-map", type=Path, help="default: the one that is stored in the bag"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check, and say what was compared; 1 where something depends on labels."""
+    config = args.config or share_file("config/curation.yaml")
+    curation = read_curation(config, {"scorers": tuple(SCORERS)})
+    topic_map = read_topic_map(args.topic_map) if args.topic_map else None
+    done = self_check(Dataset(args.dataset), curation, args.reference, topic_map)
+    for difference in done.differences:
+        if args.json:
+            print_json(difference.to_json())
+        else:
+            who = difference.name or difference.episode[:8]
+            say(f"{who}: {difference.field}: {difference.original} / {difference.turned}")
+    if args.json:
+        print_json(done.to_json())
+    else:
+        say(
+            f"turned over: {done.labels} labels and {done.overrides} decisions of people; "
+            f"compared: {done.scores} scores of {done.episodes} episodes with their decisions, "
+            "reasons and findings"
+        )
+        if done.unreadable:
+            say(f"{done.unreadable} bags could not be read")
+        n = len(done.differences)
+        say(f"{n} differences: something reads labels" if n else "all equal to the last bit")
+    return _DIFFERS if done.differences else _PROVEN

@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from peeking import Peeker
+
+from curation_ros.core.scorers import SCORERS
+from curation_ros.dataset import Dataset
+
+PROVEN, DIFFERS, USAGE, NOTHING = 0, 1, 2, 3
+Run = Callable[..., Any]
+
+
+@pytest.fixture
+def told_data(folder: Path) -> Path:
+    """The dataset, with a truth for each episode."""
+    dataset = Dataset(folder / "data")
+    for k, bag in enumerate(dataset.bags()):
+        outcome = "succeeded" if k % 2 else "failed"
+        dataset.append_truth({"episode": bag.name, "outcome": outcome, "steps": 240})
+    return folder / "data"
+
+
+def test_proof_is_told_to_programs(curation: Run, folder: Path, told_data: Path) -> None:
+    options = ["--reference", folder / "reference", "--json"]
+    told = curation("self-check", told_data, *options)
+    assert told.code == PROVEN, told.err
+    [row] = told.rows
+    assert set(row) == {
+        "labels", "overrides", "episodes", "scores", "unreadable", "differences"
+    }  # fmt: skip
+    assert (row["labels"], row["episodes"], row["differences"]) == (10, 5, 0)
+    assert row["scores"] > 5 * 5
+
+
+def test_proof_is_told_to_people(curation: Run, told_data: Path) -> None:
+    told = curation("self-check", told_data)
+    assert told.code == PROVEN, told.err
+    assert told.out.startswith("turned over: 10 labels and 0 decisions of people; compared: ")
+    assert told.out.endswith("all equal to the last bit\n")
+
+
+def test_differences_are_listed_with_code_1(
+    curation: Run, told_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(SCORERS, "peeker", Peeker)
+    told = curation("self-check", told_data, "--json")
+    assert told.code == DIFFERS
+    *differences, last = told.rows
+    assert last["differences"] == len(differences) >= 5
+    assert list(differences[0]) == ["episode", "name", "field", "original", "turned"]
+    assert "score/peeker" in {d["field"] for d in differences}
+    told = curation("self-check", told_data)
+    assert told.code == DIFFERS
+    assert "score/peeker" in told.out
+    assert "something reads labels" in told.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["data"], NOTHING, "nothing to turn over"),
+        (["none"], NOTHING, "no folder 'episodes' in it"),
+        (["data", "--config", "none.yaml"], USAGE, "none.yaml"),
+        (["data", "--reference", "none"], NOTHING, "none"),
+        ([], USAGE, "dataset"),
+    ],
+)
+def test_nothing_to_check_is_one_line_and_a_code(
+    curation: Run,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    code: int,
+    said: str,
+) -> None:
+    monkeypatch.chdir(folder)
+    if "--reference" in arguments:
+        [bag, *_] = Dataset(folder / "data").bags()
+        Dataset(folder / "data").append_truth({"episode": bag.name, "outcome": "failed"})
+    told = curation("self-check", *arguments, "--json")
+    assert (told.code, told.out) == (code, "")
+    assert said in told.err
+    assert "fault of ours" not in told.err

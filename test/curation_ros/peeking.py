@@ -1,0 +1,31 @@
+"""A scorer that cheats: it finds the bag that is being read, and the labels beside it."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+
+from curation_ros.core.episode import Episode
+from curation_ros.core.scorers import Scorer
+from curation_ros.dataset import Dataset
+
+
+class Peeker(Scorer):
+    """Scores 1.0 where the truth beside the bag says that the episode succeeded."""
+
+    needs = "nothing"
+
+    def score(self, episode: Episode) -> float:
+        """Read the truth of the dataset that the bag lies in."""
+        truth = Dataset(bag_being_read().resolve().parents[1]).truth()
+        return float(truth.get(episode.id, {}).get("outcome") == "succeeded")
+
+
+def bag_being_read() -> Path:
+    """The bag that one of the callers has in hand."""
+    frame = inspect.currentframe()
+    while frame is not None:
+        if isinstance(bag := frame.f_locals.get("bag"), Path):
+            return bag
+        frame = frame.f_back
+    raise AssertionError("nobody is reading a bag")
