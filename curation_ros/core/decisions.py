@@ -203,7 +203,8 @@ def decide(
 
     A recording that cannot be trusted is for review whatever its scores, with its finding as the
     reason; unless it is bad at an end only, and the rule keeps the rest: that is salvaged.
-    Then the rule judges.
+    Then the rule judges; what it would keep although the task was seen to fail is for a person.
+    Odd motion is noted and decides nothing.
 
     Args:
         seen: the episode, examined.
@@ -229,6 +230,9 @@ def decide(
         verdict, reason = "review", no_rule
     else:
         verdict, reason = rule.judge(seen.scores, seen.abstained, seen.words, seen.episode)
+        failed = [f for f in seen.findings if f.kind == "task"]
+        if verdict == "keep" and failed:
+            verdict, reason = "review", f"{failed[0].id}: {failed[0].message}; but {reason}"
     return Decision(
         episode=seen.episode,
         name=seen.name,

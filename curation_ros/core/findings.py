@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 Kind = Literal["recording", "motion", "task"]
 
@@ -32,6 +33,7 @@ FINDINGS: dict[str, tuple[Kind, str]] = {
     "unreadable": ("recording", "the file cannot be opened or read"),
     "unsupported-compression": ("recording", "compressed in a way that is not read"),
     "unusable": ("recording", "no episode could be made of it"),
+    "wrong-id": ("recording", "the folder is named after another episode than the bag is of"),
     "wrong-type": ("recording", "a topic has another type than the topic map says"),
     # The samples: seen by the builder, the owner of the episode or the recorder.
     "aborted": ("recording", "the owner of the episode gave it up"),
@@ -86,3 +88,13 @@ class Finding:
             "message": self.message,
             "span": list(self.span),
         }
+
+    @classmethod
+    def from_json(cls, raw: Mapping[str, Any]) -> Finding:
+        """Read what `to_json` wrote.
+
+        Raises:
+            KeyError, TypeError, ValueError: if it is none.
+        """
+        first, last = raw["span"]
+        return cls(str(raw["id"]), str(raw["message"]), (int(first), int(last)))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from curation_ros.core.checks import Baseline, check_episode
 from curation_ros.core.decisions import CURATOR, Decision, decide, untrustworthy
 from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
 from curation_ros.core.examination import Examination, Part
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 NO_REFERENCE = "no reference"
 NO_DATASET = "it compares with the whole dataset, which was not given"
+#: Checks that read the gripper's command: void where its meaning is in doubt.
+_BY_GRIPPER = ("clipped-start", "never-grasped", "opened-early", "unfinished")
 #: Raised when the meaning of the state hash, or what an examination finds, changes.
 _STATE_VERSION = 2
 #: References are scored by scorers that were fitted without them; above this many, in groups.
@@ -69,6 +72,7 @@ class Curation:
         unfitted_: name -> why a scorer could not be fitted; it abstains with that.
         length_: fitted length control; without a reference a mode that needs one becomes 'none'.
         ruling_: the rule, as far as it can be fitted without the dataset.
+        baseline_: what the reference looks like, for the checks.
         reference_ids_: sorted ids of the reference episodes.
         dataset_ids_: sorted ids of the dataset's episodes, where `fit_dataset` has seen them.
     """
@@ -169,6 +173,7 @@ class Curation:
         if self.length_.needs_reference and not episodes:
             self.length_ = LengthControl("none")
         self.length_.fit(episodes)
+        self.baseline_ = Baseline().fit(episodes)
         self.scorers_: dict[str, Scorer] = {}
         self.unfitted_: dict[str, str] = {}
         for name in self.scorers:
@@ -395,6 +400,7 @@ class Curation:
         Raises:
             NotFittedError: before `fit`.
         """
+        self._check_fitted()
         findings = self._findings(episode)
         scores, abstained, words, seen = self._look(episode)
         part = None
@@ -424,9 +430,12 @@ class Curation:
         )
 
     def _findings(self, episode: Episode) -> tuple[Finding, ...]:
-        if any(f.id == "gripper-meaning" for f in episode.findings):
-            return episode.findings
-        return episode.findings + gripper_findings(episode)
+        """Those that came with the episode, and what its arrays show."""
+        seen = (*gripper_findings(episode), *check_episode(episode, self.baseline_))
+        known = {f.id for f in episode.findings}
+        if any(f.id == "gripper-meaning" for f in (*episode.findings, *seen)):
+            known.update(_BY_GRIPPER)
+        return (*episode.findings, *(f for f in seen if f.id not in known))
 
     def _look(
         self, episode: Episode
@@ -526,6 +535,7 @@ class Curation:
                 for name, scorer in self.scorers_.items()
             },
             "length": self.length_.describe(),
+            "baseline": self.baseline_.fitted(),
             "reference": self.reference_ids_,
             "dataset": self.dataset_ids_,
         }
@@ -593,7 +603,8 @@ def _check_reference(episodes: Sequence[Episode]) -> None:
         if episode.id in seen:
             refused.append(f"{episode.name} ({episode.id}): it is there twice")
         seen.add(episode.id)
-        faults = untrustworthy(episode.findings + gripper_findings(episode))
+        seen_in = (*episode.findings, *gripper_findings(episode), *check_episode(episode))
+        faults = untrustworthy(seen_in)
         if len(episode) < 2:
             refused.append(f"{episode.name} ({episode.id}): it has {len(episode)} steps")
         elif faults:

@@ -161,7 +161,8 @@ def test_decision_is_what_the_episode_deserves(dataset: Dataset) -> None:
     [good] = _watch(live, _good(), _stream_of("good"))
     [early] = _watch(live, _early(), _stream_of("early"))
     assert (good.decision.verdict, good.decision.findings) == ("keep", ())
-    assert (early.decision.verdict, early.decision.findings) == ("discard", ())
+    assert early.decision.verdict == "discard"
+    assert [f.id for f in early.decision.findings] == ["opened-early"]
     assert good.latency_s is not None
     assert good.latency_s > 0
     assert good.decision.scores["length"] == -240.0
@@ -246,7 +247,7 @@ def test_bag_wins_where_the_curator_missed_something(dataset: Dataset) -> None:
     live = _curator(dataset)
     [decided] = _watch(live, _good(), _lossy(samples))
     assert decided.decision.verdict == "review"
-    assert {f.id for f in decided.decision.findings} == {"gap", "incomplete"}
+    assert {f.id for f in decided.decision.findings} == {"clipped-start", "gap", "incomplete"}
     record(dataset, _good(), samples=samples)
     second = _told(live.bag_closed(_good().id))
     assert (second.revision, second.verdict, second.evidence["bag"]) == (2, "keep", "differs")
@@ -414,10 +415,11 @@ def test_replay_gives_the_same_decision_and_no_second_line(dataset: Dataset) -> 
 def test_replayed_episodes_may_lie_at_the_same_time(dataset: Dataset) -> None:
     live = _curator(dataset)
     assert (_good().start_ns, len(_good())) == (_early().start_ns, len(_early()))
-    for name, verdict in (("good", "keep"), ("early", "discard")) * 2:
+    for name, verdict, found in (("good", "keep", []), ("early", "discard", ["opened-early"])) * 2:
         episode = {"good": _good, "early": _early}[name]()
         [decided] = _watch(live, episode, _stream_of(name), source="replay")
-        assert (decided.decision.verdict, decided.decision.findings) == (verdict, ())
+        assert decided.decision.verdict == verdict
+        assert [f.id for f in decided.decision.findings] == found
 
 
 def test_replay_under_another_state_is_a_new_revision(dataset: Dataset) -> None:
@@ -597,14 +599,14 @@ def test_removing_the_labels_changes_no_decision(dataset: Dataset) -> None:
 
 
 def _share(share: float = 0.5) -> Curation:
-    params = {"value": share}
+    options: dict[str, Any] = {"rule_scorer": "length", "rule_params": {"value": share}}
     reference = make_reference(np.random.default_rng(7))
-    return Curation(scorers=SCORERS, rule="top-fraction", rule_params=params).fit(reference)
+    return Curation(scorers=SCORERS, rule="top-fraction", **options).fit(reference)
 
 
 def _episodes(n: int, first: int = 100) -> list[Episode]:
-    """Each opens a little later than the one before."""
-    options = [{"open_at": 120 + 5 * k, "name": f"pick-{k}"} for k in range(n)]
+    """Each is a little shorter than the one before."""
+    options = [{"n_steps": 260 - 5 * k, "name": f"pick-{k}"} for k in range(n)]
     return [
         make_episode(
             np.random.default_rng(first + k),
@@ -636,7 +638,7 @@ def test_curator_that_starts_again_goes_on_with_what_was_scored(dataset: Dataset
         _watch(_curator(dataset, _share()), episode, samples_of(episode))
     [decided] = _watch(_curator(dataset, _share()), episodes[4], samples_of(episodes[4]))
     assert decided.decision.evidence["fitted_on"]["episodes"] == 5
-    other = Curation(scorers=SCORERS, rule="top-fraction").fit([])  # scores of another state
+    other = Curation(scorers=SCORERS, rule="top-fraction").fit([])  # has another hash
     [decided] = _watch(_curator(dataset, other), episodes[0], samples_of(episodes[0]))
     assert decided.decision.evidence["fitted_on"]["episodes"] == 1
 

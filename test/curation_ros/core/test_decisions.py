@@ -67,6 +67,11 @@ def test_faulty_recording_is_never_kept_in_silence(finding_id: str) -> None:
         if stops:
             assert got.verdict == "review"
             assert got.reason == f"{finding_id}: what was found"
+        elif finding.kind == "task" and score > 0:
+            assert got.verdict == "review"
+            assert got.reason == f"{finding_id}: what was found; but s 1.00 at or above 0.00, " + (
+                "as configured"
+            )
         else:
             assert got.verdict == ("keep" if score > 0 else "discard")
 
