@@ -275,7 +275,7 @@ class _Job:
         self._type_name = type_name
         self._paths = paths
         self._messages = messages
-        self._values = np.empty((len(messages), len(paths)))
+        self._values = np.full((len(messages), len(paths)), np.nan)
         # Column -> rows and their texts, part by part.
         self._texts: dict[int, list[tuple[npt.NDArray[np.int64], npt.NDArray[np.str_]]]] = {
             k: [] for k, path in enumerate(paths) if path.is_text

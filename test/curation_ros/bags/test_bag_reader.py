@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
+import struct
 import uuid
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +38,7 @@ from curation_ros.bags import (
     read_episode,
     recover_bag,
 )
+from curation_ros.bags.mcap_file import read_info
 from curation_ros.core.errors import BagError, ConfigError
 from curation_ros.core.topic_map import TopicMap, topic_map_from_json
 
@@ -122,6 +126,90 @@ def test_digest_is_the_same_without_metadata_file_and_by_file(tmp_path: Path) ->
     assert read_episode(tmp_path / "ep").digest == digest
     (tmp_path / "ep" / "metadata.yaml").unlink()
     assert read_episode(tmp_path / "ep").digest == digest
+
+
+def test_custom_data_is_the_same_with_and_without_our_record(tmp_path: Path) -> None:
+    custom_data = _custom_data() | {"": "é: {", "note": "1"}
+    writer = write_bag(tmp_path / "ep", episode_messages(), custom_data=custom_data)
+    assert open_bag(tmp_path / "ep").custom_data == custom_data
+    assert open_bag(writer.path).custom_data == custom_data
+    # Without it, as bags of older versions are: the YAML says the same.
+    raw = writer.path.read_bytes()
+    assert raw.count(b"curation_ros") > raw.count(b"curation_ros 0")
+    name = struct.pack("<I", 12) + b"curation_ros"
+    writer.path.write_bytes(_with_summary_crc(raw.replace(name, name[:-1] + b"t")))
+    assert read_info(writer.path).own is None
+    assert open_bag(tmp_path / "ep").custom_data == custom_data
+    assert open_bag(writer.path).custom_data == custom_data
+
+
+def test_metadata_file_that_was_changed_wins_over_our_record(tmp_path: Path) -> None:
+    write_bag(tmp_path / "ep", episode_messages(), custom_data={"note": "recorded"})
+    metadata = tmp_path / "ep" / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("recorded", "changed"))
+    assert open_bag(tmp_path / "ep").custom_data == {"note": "changed"}
+    file = tmp_path / "ep" / "ep_0.mcap"
+    file.rename(tmp_path / "ep" / "other.mcap")
+    with pytest.raises(BagError, match=r"names ep_0\.mcap, which is not there"):
+        open_bag(tmp_path / "ep")
+
+
+def _with_summary_crc(raw: bytes) -> bytes:
+    start = struct.unpack_from("<Q", raw, len(raw) - 28)[0]
+    return raw[:-12] + struct.pack("<I", zlib.crc32(raw[start:-12])) + raw[-8:]
+
+
+def test_samples_are_the_messages_in_file_order(tmp_path: Path) -> None:
+    write_bag(tmp_path / "ep", episode_messages(30), custom_data=_custom_data(30))
+    bag = open_bag(tmp_path / "ep")
+    topic_map = _topic_map()
+    names = {f"/{topic}": topic for topic in topic_map.topics}
+    samples = bag.samples(topic_map)
+    expected = [
+        (names[m.topic], m.publish_time_ns, m.sequence, m.data) for m in bag.messages(names)
+    ]
+    assert [sample[:4] for sample in samples] == expected
+    blocks = {topic: list(rest) for topic, rest in itertools.groupby(
+        sorted(bag.blocks(topic_map), key=lambda b: b.topic), key=lambda b: b.topic
+    )}  # fmt: skip
+    assert set(blocks) == set(topic_map.topics)
+    for topic, parts in blocks.items():
+        found = [
+            (topic, int(b.stamps_ns[k]), int(b.seqs[k]), b.messages[k])
+            for b in parts
+            for k in range(len(b.messages))
+        ]
+        assert found == [sample for sample in expected if sample[0] == topic]
+
+
+def test_one_topic_may_feed_two_of_the_map_and_come_on_two_channels(tmp_path: Path) -> None:
+    data = [to_cdr(pose(START_NS + k, (float(k), 0.0, 0.0))) for k in range(6)]
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file, chunk_size=200)
+        writer.start(profile="ros2")
+        schema = writer.register_schema(POSE, "ros2msg", POSE_TEXT)
+        channels = [writer.register_channel("/eef_pose", "cdr", schema) for _ in range(2)]
+        for k, message in enumerate(data):
+            writer.add_message(channels[k % 2], k, message, k)
+        writer.finish()
+    field = {"topic": "eef_pose", "type": POSE, "role": "clock", "values": ["pose.position.x"]}
+    topic_map = topic_map_from_json(
+        {"fields": {"a": field, "b": field | {"topic": "/eef_pose", "role": "observation"}}}
+    )
+    bag = open_bag(tmp_path / "a.mcap")
+    assert [(s.topic, s.stamp_ns - START_NS) for s in bag.samples(topic_map)] == [
+        (topic, k) for k in range(6) for topic in ("eef_pose", "/eef_pose")
+    ]
+    episode = read_episode(tmp_path / "a.mcap", topic_map)
+    assert episode.field("a")[:, 0].tolist() == episode.field("b")[:, 0].tolist() == list(range(6))
+
+
+def test_message_without_room_for_a_stamp_is_named(tmp_path: Path) -> None:
+    with (tmp_path / "a.mcap").open("wb") as file:
+        _write_mcap(file, [("/eef_pose", POSE, POSE_TEXT, [b"\0\1\0\0"])])
+    for read in (lambda bag: bag.samples(_topic_map()), lambda bag: [*bag.blocks(_topic_map())]):
+        with pytest.raises(BagError, match=r"/eef_pose: message of 4 bytes is too short"):
+            read(open_bag(tmp_path / "a.mcap"))
 
 
 def test_foreign_bag_of_rosbags_gets_a_stable_id(tmp_path: Path) -> None:

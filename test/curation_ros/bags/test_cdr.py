@@ -25,9 +25,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.records import Schema
 
-from curation_ros.bags.cdr import CdrDecoder
+from curation_ros.bags.cdr import CdrDecoder, shared_decoder
 from curation_ros.bags.schemas import message_schema
 from curation_ros.core.errors import BagError, ConfigError, EpisodeError
+from curation_ros.core.stream import Messages
 
 JOINT_NAMES = [f"panda_joint{i}" for i in range(1, 8)]
 
@@ -517,3 +518,158 @@ def test_bytes_of_rclpy_are_read() -> None:
         ours = to_cdr(joint_state(7_000_000_000, {"a": 0.5, "b": 1.5}, velocity, effort))
         theirs = to_plain(decoder.read_message(JOINTS, ours.replace(b"world", b"base\0")))
         assert theirs["effort"] == effort
+
+
+# --- blocks -------------------------------------------------------------------------------------
+
+_PATHS = {
+    STATUS: [
+        "status.0.message",
+        "status.0.values.progress",
+        "status.0.level",
+        "header.stamp.nanosec",
+        "status.0.hardware_id",
+    ],
+    JOINTS: ["position.b", "effort.0", "header.frame_id", "position.a", "velocity.1"],
+}
+
+
+def _mixed_messages(type_name: str, n: int, rng: np.random.Generator) -> list[bytes]:
+    """Regular messages among those with other names, orders, lengths, and damages."""
+
+    def text(longest: int = 9) -> str:
+        return "".join(rng.choice(list("abé"), int(rng.integers(0, longest))))
+
+    out = []
+    for k in range(n):
+        odd = int(rng.integers(0, 8))
+        message: Any
+        if type_name == STATUS:
+            values = {"index": text(), "progress": repr(float(rng.random()))[: odd + 3]}
+            if odd == 1:
+                values = {text(): "x"} | dict(reversed(values.items()))
+            message = status(k, text(), values)
+        else:
+            names = list("abc") if odd else list(rng.permutation(["a", "b", "cc", "d"]))
+            lists = {"velocity": [] if odd == 1 else None, "effort": [1.5, k] if odd > 2 else None}
+            message = joint_state(k, {str(x): float(rng.normal()) for x in names}, **lists)
+        data = bytearray(to_cdr(message, little_endian=bool(rng.integers(5))))
+        damage = int(rng.integers(0, 12))
+        if damage == 0:
+            data = data[: int(rng.integers(0, len(data)))]
+        elif damage == 1:
+            for at in rng.integers(0, len(data), 2):
+                data[at] = int(rng.integers(256))
+        elif damage == 2:
+            at = 4 * int(rng.integers(1, len(data) // 4))
+            data[at : at + 4] = struct.pack("<I", int(rng.choice([0, 1, 5, 2**31, 2**32 - 1])))
+        elif damage == 3:
+            data += bytes(rng.bytes(int(rng.integers(1, 9))))
+        out.append(bytes(data))
+    return out
+
+
+def _block(messages: list[bytes], rng: np.random.Generator) -> Messages:
+    """Messages here and there in a buffer, in another order than that of their rows."""
+    buffer, starts = bytearray(), [0] * len(messages)
+    for row in rng.permutation(len(messages)).tolist():
+        buffer += rng.bytes(int(rng.integers(0, 4)))
+        starts[row] = len(buffer)
+        buffer += messages[row]
+    return Messages(
+        np.frombuffer(bytes(buffer), dtype=np.uint8),
+        np.array(starts, dtype=np.int64),
+        np.array([len(data) for data in messages], dtype=np.int64),
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.sampled_from([STATUS, JOINTS]),
+    st.integers(0, 60),
+    st.integers(0, 2**32 - 1),
+    st.booleans(),
+)
+def test_a_block_gives_what_the_messages_give_one_by_one(
+    type_name: str, n: int, seed: int, is_warm: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    paths = _PATHS[type_name]
+    decoder = CdrDecoder()
+    if is_warm:  # it knows many layouts, also some of those that come
+        decoder.decode_block(
+            type_name, paths, Messages.joined(_mixed_messages(type_name, 99, rng))
+        )
+    messages = _mixed_messages(type_name, n, rng)
+    values, texts, bad = decoder.decode_block(type_name, paths, _block(messages, rng))
+    assert values.shape == (n, len(paths))
+    for row, data in enumerate(messages):
+        fresh = CdrDecoder()  # it knows no layout, so it walks
+        if row in bad:
+            with pytest.raises(EpisodeError) as caught:
+                fresh.decode(type_name, paths, [data])
+            assert str(bad[row]) == str(caught.value)
+            continue
+        for k, column in enumerate(fresh.decode(type_name, paths, [data])):
+            if k in texts:
+                assert texts[k][row] == column[0]
+            else:
+                np.testing.assert_equal(values[row, k], column[0])
+    assert set(texts) == {k for k, p in enumerate(paths) if p.split(".")[-1] in _TEXT_MEMBERS}
+
+
+_TEXT_MEMBERS = ("message", "progress", "hardware_id", "frame_id")
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sampled_from(_all_types()), st.integers(0, 2**32 - 1), st.booleans())
+def test_a_warm_decoder_reads_any_type_as_a_new_one(
+    type_name: str, seed: int, little_endian: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    kinds = [to_cdr(random_message(type_name, rng), little_endian=little_endian) for _ in range(9)]
+    decoder = CdrDecoder()
+    plain = [decoder.read_message(type_name, data) for data in kinds]
+    paths = sorted(set.intersection(*(set(_leaf_paths(type_name, p)) for p in plain)))[:12]
+    block = Messages.joined([kinds[k] for k in rng.integers(0, 9, 60)])
+    first = decoder.decode_block(type_name, paths, block)
+    again = decoder.decode_block(type_name, paths, block)
+    np.testing.assert_array_equal(first.values, again.values)
+    assert {k: v.tolist() for k, v in first.texts.items()} == {
+        k: v.tolist() for k, v in again.texts.items()
+    }
+    assert first.bad == again.bad == {}
+
+
+def test_a_name_with_a_zero_behind_it_is_another_name() -> None:
+    rng = np.random.default_rng(4)
+    messages = [
+        to_cdr(status(k, "x" * (k % 13), {"key": "v" * (k % 7), "last": "1"})) for k in range(90)
+    ]
+    odd = to_cdr(status(1, "x", {"key\0": "v", "last": "1"}))
+    decoder = CdrDecoder()
+    decoder.decode_block(STATUS, ["status.0.values.key"], Messages.joined(messages))
+    columns = decoder.decode_block(
+        STATUS, ["status.0.values.key"], _block([*messages, odd, messages[0]], rng)
+    )
+    assert list(columns.bad) == [90]
+    assert "'key' once, found it 0 times" in str(columns.bad[90])
+    assert columns.texts[0][:90].tolist() == ["v" * (k % 7) for k in range(90)]
+
+
+def test_bad_messages_cost_neither_their_neighbours_nor_much_time() -> None:
+    good = _joint_states(5)
+    bad = [data.replace(b"panda_joint3", b"panda_jointX") for data in _joint_states(300)]
+    columns = CdrDecoder().decode_block(
+        JOINTS, ["position.panda_joint3"], Messages.joined([*bad, *good])
+    )
+    assert sorted(columns.bad) == list(range(300))
+    assert columns.values[300:, 0].tolist() == [k + 0.2 for k in range(5)]
+
+
+def test_bags_with_equal_definitions_share_a_decoder() -> None:
+    texts = {JOINTS: message_schema(JOINTS).text, POSE: message_schema(POSE).text}
+    assert shared_decoder(texts) is shared_decoder(dict(reversed(texts.items())))
+    other = shared_decoder(texts | {POSE: "float64 other\n"})
+    assert other.read_message(POSE, b"\0\1\0\0" + struct.pack("<d", 3.5)) == {"other": 3.5}
+    assert shared_decoder(texts).has_header(POSE)

@@ -18,7 +18,7 @@ from curation_ros.core.builder import EpisodeBuilder
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import EpisodeError
 from curation_ros.core.findings import Finding
-from curation_ros.core.stream import NS_PER_S, Sample
+from curation_ros.core.stream import NS_PER_S, Messages, Sample, SampleBlock
 from curation_ros.core.topic_map import TopicMap, topic_map_from_json
 
 START_NS = 1_781_000_000_000_000_000
@@ -224,6 +224,63 @@ def test_any_interleaving_and_batching_gives_the_same_episode(data: st.DataObjec
         "clock-back", "duplicate-stamp", "gap", "incomplete", "not-finite", "undecodable",
         "unknown-phase",
     }  # fmt: skip
+
+
+def _blocks(samples: Sequence[Sample], cuts: Sequence[int]) -> list[SampleBlock]:
+    """Samples of one topic in blocks that end at `cuts`."""
+    edges = sorted({0, *(min(cut, len(samples)) for cut in cuts), len(samples)})
+    return [
+        SampleBlock(
+            samples[0].topic,
+            np.array([s.stamp_ns for s in part], dtype=np.int64),
+            np.array([s.seq for s in part], dtype=np.int64),
+            Messages.joined([s.data for s in part]),
+        )
+        for first, stop in itertools.pairwise(edges)
+        for part in [samples[first:stop]]
+    ]
+
+
+@given(data=st.data())
+def test_blocks_give_the_same_episode_as_their_samples(data: st.DataObject) -> None:
+    queues: dict[str, list[SampleBlock | list[Sample]]] = {}
+    for topic in TOPICS:
+        samples = [s for s in _AWKWARD if s.topic == topic]
+        cuts = data.draw(st.lists(st.integers(0, len(samples)), max_size=6))
+        queues[topic] = [
+            block if data.draw(st.integers(0, 3)) else _samples_of(block)
+            for block in _blocks(samples, cuts)
+        ]
+    turns = data.draw(st.permutations([t for t, blocks in queues.items() for _ in blocks]))
+    builder = _builder()
+    for topic in turns:
+        part = queues[topic].pop(0)
+        if isinstance(part, SampleBlock):
+            builder.push_block(part)
+        else:
+            for sample in part:
+                builder.push(sample)
+        if data.draw(st.integers(0, 5)) == 0:
+            builder.partial()
+    built = builder.finish(_at(74), _COUNTS)
+    expected = _build(_AWKWARD, end=74, counts=_COUNTS)
+    assert same_arrays(built, expected)
+    assert built.digest == expected.digest
+    assert built.findings == expected.findings
+
+
+def _samples_of(block: SampleBlock) -> list[Sample]:
+    numbers = zip(block.stamps_ns.tolist(), block.seqs.tolist(), strict=True)
+    return [
+        Sample(block.topic, stamp_ns, seq, block.messages[k])
+        for k, (stamp_ns, seq) in enumerate(numbers)
+    ]
+
+
+def test_block_of_a_topic_that_is_not_in_the_map_is_refused() -> None:
+    none = np.empty(0, dtype=np.int64)
+    with pytest.raises(EpisodeError, match="topic 'episode/outcome' is not in the topic map"):
+        _builder().push_block(SampleBlock("episode/outcome", none, none, Messages.joined([])))
 
 
 def test_finish_may_be_asked_twice() -> None:

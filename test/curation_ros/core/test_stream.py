@@ -1,12 +1,21 @@
 from __future__ import annotations
 
+import struct
+
+import numpy as np
 import pytest
 from bag_messages import header, joint_state, make, pose, to_cdr
 from hypothesis import given
 from hypothesis import strategies as st
 
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.stream import Sample, header_stamp_ns, playback_order
+from curation_ros.core.stream import (
+    Messages,
+    Sample,
+    header_stamp_ns,
+    header_stamps_ns,
+    playback_order,
+)
 
 STAMP_NS = 1_781_000_000_123_456_789
 
@@ -29,6 +38,40 @@ def test_message_too_short_for_a_header_is_refused(n_bytes: int) -> None:
     data = to_cdr(pose(STAMP_NS, (1.0, 2.0, 3.0)))[:n_bytes]
     with pytest.raises(EpisodeError, match=f"message of {n_bytes} bytes"):
         header_stamp_ns(data)
+
+
+@given(
+    stamps=st.lists(st.tuples(st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**32 - 1))),
+    seed=st.integers(0, 99),
+)
+def test_stamps_of_many_messages_are_those_of_each(
+    stamps: list[tuple[int, int]], seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    messages = []
+    for sec, nanosec in stamps:
+        order = int(rng.integers(2))
+        head = struct.pack("<BBHiI" if order else ">BBHiI", 0, order, 0, sec, nanosec)
+        messages.append(head + rng.bytes(int(rng.integers(0, 5))))
+    found = header_stamps_ns(Messages.joined(messages))
+    assert found.tolist() == [header_stamp_ns(data) for data in messages]
+    assert found.dtype == np.int64
+
+
+def test_one_message_too_short_for_a_header_among_many_is_refused() -> None:
+    whole = to_cdr(pose(STAMP_NS, (1.0, 2.0, 3.0)))
+    with pytest.raises(EpisodeError, match="message of 11 bytes"):
+        header_stamps_ns(Messages.joined([whole, whole[:11], whole[:3]]))
+
+
+def test_messages_give_back_their_bytes() -> None:
+    messages = [b"", b"abc", b"d", b""]
+    joined = Messages.joined(messages)
+    assert [joined[k] for k in range(len(joined))] == messages
+    some = joined.take(np.array([2, 1]))
+    assert [some[k] for k in range(2)] == [b"d", b"abc"]
+    assert [some.compact()[k] for k in range(2)] == [b"d", b"abc"]
+    assert len(some.compact().buffer) == 4
 
 
 def _samples(*pairs: tuple[str, int]) -> list[Sample]:
