@@ -41,6 +41,7 @@ LENGTHS: dict[str, str] = {
     SHORTEST_SUCCESS: "the prefix as long as the shortest success: the paper's T, uses labels",
 }
 _LENGTH_NEEDS = {
+    "phase-normalised": "phases",
     "shortest-reference": "reference",
     "percentile": "dataset",
     SHORTEST_SUCCESS: "labels",
@@ -303,10 +304,9 @@ def _scores(judged: Sequence[Episode], raw: Curation, controlled: Curation) -> d
     for episode in judged:
         before, _ = raw.score(episode)
         after, why = controlled.score(episode)
-        view = controlled.length_.apply(episode)
         for name, scorer in _LENGTH_ROWS.items():
-            before[name], _ = _score(scorer, episode)
-            after[name], reason = _score(scorer, view)
+            before[name], _ = _score(scorer, episode, LengthControl("none"))
+            after[name], reason = _score(scorer, episode, controlled.length_)
             why.pop(name, None)
             if reason:
                 why[name] = reason
@@ -318,9 +318,9 @@ def _scores(judged: Sequence[Episode], raw: Curation, controlled: Curation) -> d
     return found
 
 
-def _score(scorer: Scorer, episode: Episode) -> tuple[float | None, str]:
+def _score(scorer: Scorer, episode: Episode, control: LengthControl) -> tuple[float | None, str]:
     try:
-        return scorer.score(episode), ""
+        return scorer.score(control.apply(episode)), ""
     except EpisodeError as err:  # Abstain is one
         return None, str(err)
 

@@ -127,7 +127,8 @@ def _print(audited: Audit) -> None:
     facts = audited.facts
     control = facts["length_control"]
     mode = control["mode"] + (f":{control['value']:g}" if control["value"] is not None else "")
-    steps = f", T = {control['steps']} steps" if control["steps"] is not None else ""
+    of = " a phase" if control["needs"] == "phases" else ""
+    steps = f", {control['steps']} steps{of}" if control["steps"] is not None else ""
     say(
         f"{facts['n_good']} good and {facts['n_bad']} bad by the label {facts['labels']!r}; "
         f"{facts['reference']} reference episodes"
@@ -181,7 +182,7 @@ def _print(audited: Audit) -> None:
     say("")
     say(
         "Length: Spearman of score and steps, raw, controlled, and controlled within a label; "
-        "AUROC of the controlled score at equal length (the last two p by "
+        "AUROC of the controlled score within fifths of length (the last two p by "
         f"{facts['permutations']} permutations, seed {facts['seed']})"
     )
     _show(

@@ -304,6 +304,7 @@ def test_perfect_ranking_has_no_bootstrap_interval_and_says_so(
     [
         ("none", None, None, "nothing"),
         ("fixed", 150, 150, "nothing"),
+        ("phase-normalised", 20, 20, "phases"),
         ("percentile", 0, 228, "dataset"),
         ("percentile", 100, 300, "dataset"),
         ("shortest-success", None, 228, "labels"),
