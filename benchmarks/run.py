@@ -10,7 +10,14 @@ import sys
 from datetime import datetime, timezone
 from pathlib import Path
 
-BENCHMARKS = ("sim_speed", "graph_speed", "decision_latency", "recorder_loss", "kill_cost")
+BENCHMARKS = (
+    "sim_speed",
+    "graph_speed",
+    "decision_latency",
+    "recorder_loss",
+    "kill_cost",
+    "many_episodes",
+)
 
 
 def main(names: list[str]) -> int:
