@@ -623,7 +623,7 @@ def test_rule_over_the_dataset_is_provisional_live_and_says_what_it_has_seen(
     live = _curator(dataset, _share())
     told = [_watch(live, e, samples_of(e))[0].decision for e in _episodes(6)]
     assert [d.verdict for d in told[:3]] == ["review"] * 3
-    assert told[2].reason == "only 3 episodes are scored so far; the rule needs 4"
+    assert told[2].reason == "the rule needs 4 scored episodes; so far there are 3"
     # Each is better than all before it, so each is among the best half when it comes.
     assert [d.verdict for d in told[3:]] == ["keep"] * 3
     assert [d.evidence["basis"] for d in told] == ["provisional"] * 6
