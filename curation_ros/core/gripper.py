@@ -27,6 +27,9 @@ SETTLE_S = 0.5
 STILL_SHARE = 0.1
 #: Hysteresis on the width, as shares of its range in the episode: below, above.
 CLOSED_SHARE, OPEN_SHARE = 0.25, 0.75
+#: Continuous commands beyond the declared ends by more than this share of their distance are
+#: stray; fewer of them than the other share are a glitch, not another meaning.
+MARGIN_SHARE, STRAY_SHARE = 0.1, 0.05
 
 
 def _spec(episode: Episode) -> GripperSpec:
@@ -58,8 +61,12 @@ def _held(sign: npt.NDArray[np.int8]) -> npt.NDArray[np.int8]:
     return sign[index]
 
 
-def _commanded(episode: Episode) -> npt.NDArray[np.int8]:
-    """(T,) +1 open, -1 closed, 0 nothing commanded yet."""
+def commanded(episode: Episode) -> npt.NDArray[np.int8]:
+    """(T,) what the gripper is commanded to be: +1 open, -1 closed, 0 nothing commanded yet.
+
+    Raises:
+        EpisodeError: if the topic map declares no gripper or the episode lacks its field.
+    """
     spec = _spec(episode)
     command = gripper_command(episode)
     if spec.kind == "binary":
@@ -80,17 +87,18 @@ def is_open_command(episode: Episode) -> Mask:
     Raises:
         EpisodeError: if the topic map declares no gripper or the episode lacks its field.
     """
-    mask: Mask = _commanded(episode) > 0
+    mask: Mask = commanded(episode) > 0
     return mask
 
 
 def is_closed_command(episode: Episode) -> Mask:
     """(T,) whether the gripper is under the command to close; see `is_open_command`."""
-    mask: Mask = _commanded(episode) < 0
+    mask: Mask = commanded(episode) < 0
     return mask
 
 
-def _first_opening(state: npt.NDArray[np.int8]) -> int | None:
+def opening_of(state: npt.NDArray[np.int8]) -> int | None:
+    """First step that is open (+1) after one that was closed (-1); None if there is none."""
     if not len(state):
         return None
     hits = np.flatnonzero((state > 0) & np.logical_or.accumulate(state < 0))
@@ -105,7 +113,7 @@ def first_opening(episode: Episode) -> int | None:
     Raises:
         EpisodeError: if the topic map declares no gripper or the episode lacks its field.
     """
-    return _first_opening(_commanded(episode))
+    return opening_of(commanded(episode))
 
 
 def finger_width(episode: Episode) -> Floats | None:
@@ -149,15 +157,18 @@ def fingers_closed(episode: Episode) -> Mask | None:
 def first_finger_opening(episode: Episode) -> int | None:
     """First step with the fingers apart after they had been together, as measured."""
     width = finger_width(episode)
-    return None if width is None else _first_opening(_width_state(width))
+    return None if width is None else opening_of(_width_state(width))
 
 
 def contradiction(episode: Episode) -> str | None:
-    """Whether the fingers contradict the declared meaning of the command, in one sentence.
+    """Whether the data contradict the declared meaning of the command, in one sentence.
 
-    After each switch of the command the width is compared with that SETTLE_S later (or at the
-    next switch): it must shrink after a switch to closed and grow after one to open. Fingers that
-    do not move are no contradiction: they may be blocked, slow or not measured.
+    Refused are continuous commands beyond the declared ends; binary ones of one sign only, which
+    could never both open and close, if what they do shows that both are meant; and a sign that
+    the fingers contradict. After each switch of the command the width is compared with that
+    SETTLE_S later (or at the next switch): it must shrink after a switch to closed and grow after
+    one to open. Fingers that do not move are no contradiction: they may be blocked, slow or not
+    measured.
 
     Returns:
         The contradiction, or None where there is none or nothing to judge by.
@@ -166,40 +177,116 @@ def contradiction(episode: Episode) -> str | None:
         EpisodeError: if a field that the topic map declares is missing.
     """
     spec = episode.topic_map.gripper
-    width = finger_width(episode)
-    if spec is None or width is None or len(episode) < 2:
+    if spec is None or len(episode) < 2:
         return None
-    state = _commanded(episode)
+    command, width = gripper_command(episode), finger_width(episode)
+    if spec.kind == "continuous":
+        text = _beyond_ends(command, spec)
+    else:
+        text = _one_sided(episode, command, width, spec)
+    if text is not None or width is None:
+        return text
+    return _inverted(episode, width, spec)
+
+
+def _beyond_ends(command: Floats, spec: GripperSpec) -> str | None:
+    low, high = sorted((spec.open_value, spec.closed_value))
+    margin = MARGIN_SHARE * (high - low)
+    known = command[np.isfinite(command)]
+    stray = (known < low - margin) | (known > high + margin)
+    if not len(known) or stray.mean() <= STRAY_SHARE:
+        return None
+    return (
+        f"{stray.mean():.0%} of the commands lie outside open_value {spec.open_value:g} and "
+        f"closed_value {spec.closed_value:g}: they run from {known.min():g} to {known.max():g}"
+    )
+
+
+def _one_sided(
+    episode: Episode, command: Floats, width: Floats | None, spec: GripperSpec
+) -> str | None:
+    known = np.where(np.isfinite(command), command, np.nan)  # compares false, so it holds
+    low = np.min(known, initial=0.0, where=known < 0)
+    high = np.max(known, initial=0.0, where=known > 0)
+    if (low < 0) == (high > 0):
+        return None
+    # One sign: by the map it can only ever open, or only close, and at 0 it holds. Switches
+    # between large and small commands that move the fingers the other way show that both are
+    # meant.
+    wanted = 1 if (high or low) * spec.opens > 0 else -1
+    share = np.abs(known) / max(-low, high)
+    level = _held((share >= OPEN_SHARE).astype(np.int8) - (share <= CLOSED_SHARE).astype(np.int8))
+    switches = np.flatnonzero(level[:-1] * level[1:] < 0) + 1
+    if not len(switches):
+        return None
+    ends = _settled(episode, switches)
+    text = (
+        f"the command is never {'below' if high else 'above'} 0, so that with kind binary it can "
+        f"only {'open' if wanted > 0 else 'close'}"
+    )
+    if width is None:
+        # Without fingers: it stays large, then small, each for longer than a press of a button.
+        settle_ns = int(SETTLE_S * NS_PER_S)
+        edges = np.concatenate([[0], switches, [len(level) - 1]])
+        long = np.diff(episode.stamps_ns[edges]) >= settle_ns
+        fell = level[switches] < 0
+        if not (fell & long[:-1] & long[1:]).any():
+            return None
+        return f"{text}, yet it goes back to {known[switches[fell][0]]:g}: kind continuous?"
+    moved = np.where(np.isfinite(width[ends] - width[switches]), width[ends] - width[switches], 0)
+    worst = int(np.argmin(moved * wanted))
+    if -moved[worst] * wanted <= STILL_SHARE * _largest(width):
+        return None
+    return (
+        f"{text}, yet the fingers moved {'together' if wanted > 0 else 'apart'} by "
+        f"{_distance(episode, moved[worst])} after it went to {known[switches[worst]]:g}: "
+        "kind continuous?"
+    )
+
+
+def _inverted(episode: Episode, width: Floats, spec: GripperSpec) -> str | None:
+    state = commanded(episode)
     before, after = state[:-1], state[1:]
     switches = np.flatnonzero((before != 0) & (before != after)) + 1
     if not len(switches):
         return None
-    stamps = episode.stamps_ns
-    deadline = (
-        np.searchsorted(stamps, stamps[switches] + int(SETTLE_S * NS_PER_S), side="right") - 1
-    )
-    ends = np.minimum(deadline, np.append(switches[1:], len(stamps) - 1))
-    moved = width[ends] - width[switches]
+    moved = width[_settled(episode, switches)] - width[switches]
     wanted = state[switches]  # +1: must grow
     agreement = np.where(np.isfinite(moved), moved * wanted, 0.0)
     worst = int(np.argmin(agreement))
-    finite = width[np.isfinite(width)]
-    scale = float(np.abs(finite).max()) if len(finite) else 0.0
-    if agreement.sum() >= 0 or -agreement[worst] <= STILL_SHARE * scale:
+    if agreement.sum() >= 0 or -agreement[worst] <= STILL_SHARE * _largest(width):
         return None
-    unit = episode.topic_map.fields[spec.fingers].unit
-    amount = abs(float(moved[worst]))
-    distance = f"{amount * 1000:.0f} mm" if unit == "m" else f"{amount:.3g} {unit}".strip()
     act = "an opening" if wanted[worst] > 0 else "a closing"
     way = "together" if wanted[worst] > 0 else "apart"
     return (
-        f"after {act} command the fingers moved {way} by {distance}: "
+        f"after {act} command the fingers moved {way} by {_distance(episode, moved[worst])}: "
         f"the sign declared in the topic map (opens: {spec.opens:+d}) looks inverted"
     )
 
 
+def _settled(episode: Episode, switches: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """Step until which the fingers had time to follow each switch: SETTLE_S or the next one."""
+    stamps = episode.stamps_ns
+    deadline = (
+        np.searchsorted(stamps, stamps[switches] + int(SETTLE_S * NS_PER_S), side="right") - 1
+    )
+    ends: npt.NDArray[np.intp] = np.minimum(deadline, np.append(switches[1:], len(stamps) - 1))
+    return ends
+
+
+def _largest(width: Floats) -> float:
+    finite = width[np.isfinite(width)]
+    return float(np.abs(finite).max()) if len(finite) else 0.0
+
+
+def _distance(episode: Episode, moved: float) -> str:
+    spec = _spec(episode)
+    unit, amount = episode.topic_map.fields[spec.fingers].unit, abs(float(moved))
+    return f"{amount * 1000:.0f} mm" if unit == "m" else f"{amount:.3g} {unit}".strip()
+
+
 def gripper_findings(episode: Episode) -> tuple[Finding, ...]:
-    """The finding `gripper-meaning` where the fingers contradict the topic map, else nothing."""
+    """The finding `gripper-meaning` where the data contradict the topic map, else nothing."""
     try:
         text = contradiction(episode)
     except EpisodeError:  # a missing field is the builder's finding, not ours

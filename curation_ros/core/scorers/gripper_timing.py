@@ -93,9 +93,10 @@ class GripperTiming(Scorer):
                 inverted = gripper.contradiction(episode)
                 if inverted is not None:
                     raise Abstain(inverted)
-                if not gripper.is_closed_command(episode).any():
+                state = gripper.commanded(episode)
+                if not (state < 0).any():
                     raise Abstain("the gripper was never commanded to close")
-                return gripper.first_opening(episode)
+                return gripper.opening_of(state)
             width = gripper.finger_width(episode)
         except Abstain:
             raise

@@ -65,10 +65,10 @@ class Smoothness(Scorer):
 
     The paper names neither rate, cut-off nor threshold: the rate is by default the episode's own,
     the others are those of the authors of the measure. `rate_hz` gives one rate to all; at 1 Hz,
-    the default of the paper's released library, the cut-off never applies. The norm of an action is a speed
-    where actions are velocities; for commanded positions `profile='change'` takes the norm of
-    their differences. With a binary gripper in the action its constant 1 dominates the norm: the
-    paper's definition, kept as the default; `gripper_channel=False` leaves it out.
+    the default of the paper's released library, the cut-off never applies. The norm of an action
+    is a speed where actions are velocities; for commanded positions `profile='change'` takes the
+    norm of their differences. With a binary gripper in the action its constant 1 dominates the
+    norm: the paper's definition, kept as the default; `gripper_channel=False` leaves it out.
     """
 
     needs = "nothing"

@@ -127,6 +127,113 @@ def test_fingers_that_do_not_move_are_no_contradiction(rng: np.random.Generator)
     assert contradiction(nothing) is None
 
 
+# --- kinds that the data contradict -------------------------------------------------------------
+
+
+def recoded(episode: Episode, opened: float, closed: float, **spec: object) -> Episode:
+    """The same motion of the gripper, told with other numbers, under a map with `spec` changed."""
+    is_open = episode.fields["gripper"] < 0
+    gripper = replace(topic_map().gripper or GripperSpec("gripper"), **spec)  # type: ignore[arg-type]
+    episode = with_fields(episode, gripper=np.where(is_open, opened, closed))
+    return replace(episode, topic_map=replace(topic_map(), gripper=gripper))
+
+
+def test_zero_and_one_is_not_binary_where_zero_moves_the_fingers(
+    rng: np.random.Generator,
+) -> None:
+    assert contradiction(recoded(make_episode(rng), 0.0, 1.0)) == (
+        "the command is never below 0, so that with kind binary it can only close, yet the "
+        "fingers moved apart by 72 mm after it went to 0: kind continuous?"
+    )
+    opens = {"opens": 1, "open_value": 1.0, "closed_value": 0.0}
+    assert contradiction(recoded(make_episode(rng), 1.0, 0.0, **opens)) == (
+        "the command is never below 0, so that with kind binary it can only open, yet the "
+        "fingers moved together by 72 mm after it went to 0: kind continuous?"
+    )
+    right = recoded(make_episode(rng), 1.0, 0.0, kind="continuous", **opens)
+    assert contradiction(right) is None
+
+
+def test_widths_are_not_binary(rng: np.random.Generator) -> None:
+    text = contradiction(recoded(make_episode(rng), 0.08, 0.008))
+    assert text is not None
+    assert "only close, yet the fingers moved apart by 72 mm after it went to 0.08" in text
+
+
+def test_one_sided_without_fingers_is_refused_only_where_it_stays_small(
+    rng: np.random.Generator,
+) -> None:
+    text = contradiction(recoded(make_episode(rng, open_at=180), 0.0, 1.0, fingers=""))
+    assert text is not None
+    assert text.endswith("can only close, yet it goes back to 0: kind continuous?")
+    never = make_episode(rng, open_at=None)  # 0 holds until it closes, for good
+    assert contradiction(recoded(never, 0.0, 1.0, fingers="")) is None
+    press = np.zeros((240, 1))
+    press[95:100] = 1.0  # a button: closes, and 0 holds
+    held = with_fields(recoded(never, 0.0, 1.0, fingers=""), gripper=press)
+    assert contradiction(held) is None
+
+
+def test_zero_that_holds_is_no_contradiction(rng: np.random.Generator) -> None:
+    # A button that closes, then nothing: the fingers stay together.
+    episode = make_episode(rng, open_at=None)
+    press = np.zeros((240, 1))
+    press[95:130] = 1.0
+    assert contradiction(with_fields(episode, gripper=press)) is None
+    # They close further, as the object has slipped away.
+    fingers = episode.fields["finger_position"].copy()
+    fingers[132:] = 0.0
+    slipped = with_fields(episode, gripper=press, finger_position=fingers)
+    assert contradiction(slipped) is None
+    # A policy's outputs of both signs are binary by their sign.
+    unsure = make_episode(rng).fields["gripper"] * rng.uniform(0.05, 1.0, (240, 1))
+    assert contradiction(with_fields(make_episode(rng), gripper=unsure)) is None
+
+
+def test_continuous_commands_beyond_the_declared_ends_are_refused(
+    rng: np.random.Generator,
+) -> None:
+    ends = {"kind": "continuous", "opens": 1, "open_value": 0.08, "closed_value": 0.0}
+    text = contradiction(recoded(make_episode(rng), 1.0, -1.0, **ends))
+    assert text == (
+        "100% of the commands lie outside open_value 0.08 and closed_value 0: "
+        "they run from -1 to 1"
+    )
+    assert contradiction(recoded(make_episode(rng), 0.085, -0.005, **ends)) is None  # overshoot
+    glitch = recoded(make_episode(rng), 0.08, 0.0, **ends)
+    command = glitch.fields["gripper"].copy()
+    command[50:55] = 7.0
+    command[60] = np.nan
+    assert contradiction(with_fields(glitch, gripper=command)) is None
+
+
+@given(
+    st.lists(st.sampled_from([-1.0, 0.0, 1.0, np.nan]), min_size=2, max_size=60),
+    st.sampled_from([-1, 1]),
+    st.integers(0, 3),
+)
+def test_fingers_that_obey_the_declared_meaning_never_contradict_it(
+    command: list[float], opens: int, lag: int
+) -> None:
+    ends = {"opens": opens, "open_value": float(opens), "closed_value": -float(opens)}
+    episode = commanded(*command, **ends)
+    # Open until told otherwise.
+    wide = ~is_closed_command(episode)[np.maximum(np.arange(len(command)) - lag, 0)]
+    fingers = np.outer(np.where(wide, 0.04, 0.004), [1.0, -1.0])
+    assert contradiction(with_fields(episode, finger_position=fingers)) is None
+
+
+@given(st.lists(st.floats(-1, 1, allow_nan=False), min_size=2, max_size=40), st.floats(0.01, 100))
+def test_meaning_does_not_depend_on_the_unit_of_the_command(
+    command: list[float], unit: float
+) -> None:
+    ends = {"kind": "continuous", "opens": 1}
+    here = commanded(*command, open_value=1.0, closed_value=-1.0, **ends)
+    there = commanded(*(unit * c for c in command), open_value=unit, closed_value=-unit, **ends)
+    clear = np.abs(command) > 1e-9  # at the exact middle rounding decides
+    np.testing.assert_array_equal(is_open_command(here)[clear], is_open_command(there)[clear])
+
+
 def test_gripper_finding_spans_the_episode(rng: np.random.Generator) -> None:
     episode = make_episode(rng, opens=1)
     (finding,) = gripper_findings(episode)
