@@ -551,6 +551,13 @@ def episode_of(bag: Bag, topic_map: TopicMap | None = None) -> Episode:
             f"{bag.path} was not recorded by this package: give a topic map",
             finding="no-topic-map",
         )
+    try:
+        return _built(bag, topic_map)
+    except ConfigError as err:  # a path of the map that its type has not
+        raise ConfigError(f"{bag.path}: {err}") from err
+
+
+def _built(bag: Bag, topic_map: TopicMap) -> Episode:
     blocks = list(bag.blocks(topic_map))
     clock = [b.stamps_ns for b in blocks if b.topic == topic_map.clock_topic]
     event = _event_of(bag, topic_map, np.concatenate([*clock, np.empty(0, dtype=np.int64)]))
