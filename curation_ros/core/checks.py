@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from curation_ros.core.episode import Episode
-    from curation_ros.core.stream import Floats
+    from curation_ros.core.stream import Floats, Stamps
 
 Mask = npt.NDArray[np.bool_]
 
@@ -210,8 +210,9 @@ def check_episode(episode: Episode, baseline: Baseline | None = None) -> tuple[F
     padded = _padded(episode, facts)
     stop = n if padded is None else padded[0]
     frozen = _frozen(episode, facts, spread, stop)
-    # Where values come back after that, or end in zeros, nothing jumped.
+    # Where values come back after that or after silence, or end in zeros, nothing jumped.
     recorded = [last for _, last in frozen] + ([] if padded is None else [stop - 1])
+    recorded += [int(np.searchsorted(_offsets(episode), end)) - 1 for _, end in _gaps(episode)]
     found = [
         _clipped_start(episode, facts, baseline, spread),
         *(finding for finding, _ in frozen),
@@ -271,6 +272,9 @@ def _frozen(
         known_s = None if spread is None else spread.still_s_.get(topic)
         if seconds < max(least_s, 2.0 * (known_s or 0.0)) or last >= stop:
             continue
+        begin, end = episode.span(first, last)
+        if any(begin <= gap[1] and gap[0] <= end for gap in _gaps(episode, topic)):
+            continue  # nothing came: what was seen last is held, and the gap is a finding
         # Where no trusted episode ever repeats a value, noise is always seen, and where nothing
         # at all was seen to change, nothing was seen: then do not ask whether the robot moved.
         nothing = facts.same_rows.all()
@@ -282,6 +286,15 @@ def _frozen(
         )
         found.append((Finding("frozen", text, episode.span(first, last)), last))
     return found
+
+
+def _gaps(episode: Episode, topic: str | None = None) -> list[tuple[int, int]]:
+    """Spans in which a topic, or any, was silent, as the builder found them."""
+    return [
+        f.span
+        for f in episode.findings
+        if f.id == "gap" and (topic is None or f.message.startswith(f"topic {topic!r}:"))
+    ]
 
 
 def _moved_meanwhile(episode: Episode, topic: str, first: int, last: int) -> bool:
@@ -407,6 +420,12 @@ def _task(
 
 
 # --- measurements ---------------------------------------------------------------------------
+
+
+def _offsets(episode: Episode) -> Stamps:
+    """(T,) nanoseconds from the start stamp."""
+    offsets: Stamps = episode.stamps_ns - episode.start_ns
+    return offsets
 
 
 def _quantile(values: Floats, share: float) -> float:

@@ -19,8 +19,11 @@ from episodes import (
 )
 from hypothesis import given
 from hypothesis import strategies as st
+from streams import samples_of
 
+from curation_ros.bags import CdrDecoder
 from curation_ros.core import checks
+from curation_ros.core.builder import EpisodeBuilder
 from curation_ros.core.checks import Baseline, check_episode
 from curation_ros.core.decisions import untrustworthy
 from curation_ros.core.episode import Episode
@@ -328,6 +331,25 @@ def test_constant_observation_of_another_kind_is_not_frozen() -> None:
     }
     episode = with_fields(make_episode(), weight=np.full((TASK_STEPS, 1), 9.81))
     assert _ids(replace(episode, topic_map=topic_map_from_json(raw))) == []
+
+
+@pytest.mark.parametrize("topic", ["joint_states", "eef_pose"])
+def test_silence_of_a_topic_is_not_frozen_and_no_jump_either(
+    topic: str, rng: np.random.Generator, baseline: Baseline
+) -> None:
+    """The builder holds what it saw last, and has a finding of its own for that."""
+    made = make_episode(rng)
+    raw = made.topic_map.to_json() | {"clock": "twist"}  # so that both can be held
+    builder = EpisodeBuilder(
+        topic_map_from_json(raw), CdrDecoder(), episode_id="id", name="", start_ns=made.start_ns
+    )
+    for sample in samples_of(made):
+        if sample.topic != topic or not 120 < sample.seq <= 150:
+            builder.push(sample)
+    episode = builder.finish(made.end_ns, {})
+    assert [f.id for f in episode.findings] == ["gap"]
+    assert _ids(episode) == _ids(episode, baseline) == []
+    assert "frozen" in _ids(replace(episode, findings=()))
 
 
 def test_missing_topic_is_not_frozen() -> None:
