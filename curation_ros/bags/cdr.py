@@ -30,8 +30,9 @@ from curation_ros.core.stream import Columns, Messages, rows_at
 _HEADER_TYPE = "std_msgs/msg/Header"
 _TEXT_CODES = frozenset(TEXTS.values())
 
-# Bytes that one vectorised pass copies at most, and layouts that are kept or tried.
-_BLOCK_BYTES = 16 << 20
+# Bytes that one vectorised pass copies at most (they stay in the cache of a processor), and
+# layouts that are kept or tried.
+_BLOCK_BYTES = 256 << 10
 _MAX_LAYOUTS = 8
 _MAX_CACHED = 512
 

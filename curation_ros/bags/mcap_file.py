@@ -40,7 +40,7 @@ OWN_METADATA = "curation_ros"
 
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
-_CHUNK = struct.Struct("<QQQI")
+_CHUNK = struct.Struct("<QQQII")
 _CHUNK_INDEX = struct.Struct("<QQQQI")
 _MESSAGE_INDEX = struct.Struct("<HI")
 #: Head of a message record with its opcode and length, and an entry of a message index.
@@ -60,9 +60,10 @@ _FOOTER_BYTES = _RECORD.size + 20 + len(MAGIC)
 # a few MB. And a chunk that unpacks to much more than it has is a trap: zeros pack 30,000 to 1.
 _MAX_CHUNK_BYTES = _MAX_RECORD_BYTES = 1 << 28
 _SMALL_CHUNK_BYTES, _MAX_COMPRESSION = 16 << 20, 1000
-# Files up to this size are read at once, and blocks of messages end after this much.
+# Files up to this size are read at once; blocks of messages end after so much that they still
+# stay in the cache of a processor while they are decoded.
 _SMALL_BYTES = 4 << 20
-_BLOCK_BYTES = 16 << 20
+_BLOCK_BYTES = 1 << 20
 # Schemas and channels up to this size are kept, as the next bag is likely to have them, too.
 _COMMON_BYTES = 16 << 10
 _FOREIGN = {
@@ -278,12 +279,15 @@ def _chunk_data(path: Path, at: int, body: bytes) -> bytes:
         return TornFileError(path, f"the chunk at byte {at} {what}", finding)
 
     try:
-        _, _, size, checksum = _CHUNK.unpack_from(body)
-        stream = ReadDataStream(BytesIO(body[_CHUNK.size :]))
-        compression = stream.read_prefixed_string()
-        packed = stream.read(stream.read8())
-    except (McapError, struct.error, ValueError, OverflowError) as err:
+        _, _, size, checksum, name_size = _CHUNK.unpack_from(body)
+        compression = body[_CHUNK.size : _CHUNK.size + name_size].decode()
+        (packed_size,) = struct.unpack_from("<Q", body, _CHUNK.size + name_size)
+    except (struct.error, ValueError) as err:
         raise torn("is malformed") from err
+    packed_at = _CHUNK.size + name_size + 8
+    if packed_size > len(body) - packed_at:
+        raise torn("is malformed")
+    packed = memoryview(body)[packed_at : packed_at + packed_size]
     if size > _MAX_CHUNK_BYTES:
         text = f"claims {size} bytes; {_MAX_CHUNK_BYTES} are the most that is read"
         raise torn(text, "too-large")
@@ -305,7 +309,7 @@ def _chunk_data(path: Path, at: int, body: bytes) -> bytes:
                 finding="unsupported-compression",
             )
         else:
-            data = packed
+            data = bytes(packed)
     except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError) as err:
         raise torn(f"cannot be decompressed ({compression})") from err
     if len(data) != size or (checksum and zlib.crc32(data) != checksum):
@@ -628,16 +632,18 @@ def _indexed_blocks(
     wanted = frozenset(channels)
     missing = sum(info.counts.get(channel, 0) for channel in wanted)
     group: list[_Chunk] = []
+    group_bytes = 0
     for place, entries in zip(info.chunks, indexes, strict=True):
         if not any(raw for channel, raw in entries.items() if channel in wanted):
             continue
         body = file.read(place.start + _RECORD.size, place.size - _RECORD.size)
         group.append(_Chunk(place.start, _chunk_data(path, place.start, body), entries))
-        if sum(len(chunk.data) for chunk in group) >= _BLOCK_BYTES:
+        group_bytes += len(group[-1].data)
+        if group_bytes >= _BLOCK_BYTES:
             block = _split(path, group, wanted)
             missing -= len(block.messages)
             yield block
-            group = []
+            group, group_bytes = [], 0
     if group:
         block = _split(path, group, wanted)
         missing -= len(block.messages)
