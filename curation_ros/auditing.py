@@ -214,7 +214,8 @@ def audit(
     for name in _order(scores):
         needs = "nothing" if name in _LENGTH_ROWS else controlled.scorers_[name].needs
         rows.append({"scorer": name, "needs": needs, **table.row(name, scores[name]), **facts})
-    notes = _notes(facts, lengths, good, both, other)
+    [left] = [row["auroc_controlled"] for row in rows if row["scorer"] == "length"]
+    notes = _notes(facts, lengths, good, both, other, left)
     return Audit(tuple(rows), facts, tuple(notes))
 
 
@@ -477,6 +478,7 @@ def _notes(
     good: detection.Flags,
     both: Sequence[tuple[bool, bool]],
     other: str,
+    left: float | None,
 ) -> list[str]:
     """What is to be known about all rows, in words."""
     notes = []
@@ -500,6 +502,15 @@ def _notes(
         notes.append(f"the labels {other!r} differ on {differ} of {len(both)} episodes")
     else:
         notes.append(f"the labels {other!r} are the same on all {len(both)} episodes")
-    if facts["length_control"]["needs"] == "labels":
+    control = facts["length_control"]
+    if control["mode"] == "none":
+        notes.append("length is not controlled: raw and controlled are the same")
+    elif left not in (None, 0.5):
+        shorter = int((lengths < control["steps"]).sum())
+        notes.append(
+            f"{shorter} episodes are shorter than {control['steps']} steps: after control, length "
+            f"alone still has an AUROC of {left:.3f}"
+        )
+    if control["needs"] == "labels":
         notes.append("the length control uses labels: for comparison with the paper only")
     return notes

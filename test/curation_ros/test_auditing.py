@@ -175,6 +175,21 @@ def test_length_that_is_cut_away_tells_nothing(dataset: Dataset, rng: np.random.
     assert path["auroc_raw"] is not None
 
 
+def test_length_that_is_left_after_control_is_said(
+    dataset: Dataset, rng: np.random.Generator
+) -> None:
+    episodes = _contaminated(dataset, rng)
+    left = audit(dataset, episodes, settings=_settings(length="fixed", length_value=235)).notes
+    assert (
+        "2 episodes are shorter than 235 steps: after control, length alone still has an AUROC "
+        "of 0.750"
+    ) in left
+    none = audit(dataset, episodes, settings=_settings(length="none")).notes
+    assert "length is not controlled: raw and controlled are the same" in none
+    whole = audit(dataset, episodes, settings=_settings(length="fixed", length_value=228)).notes
+    assert not [note for note in whole if "shorter" in note or "not controlled" in note]
+
+
 def test_length_that_separates_the_labels_leaves_no_question_at_equal_length(
     dataset: Dataset, rng: np.random.Generator
 ) -> None:

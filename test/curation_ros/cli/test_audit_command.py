@@ -160,6 +160,16 @@ def test_length_control_is_chosen_by_name_and_value(
     assert (control["mode"], control["steps"], control["needs"]) == (mode, steps, needs)
 
 
+def test_parameters_of_scorers_come_from_the_config(
+    curation: Run, told_data: Path, tmp_path: Path
+) -> None:
+    options = ["--scorers", "gripper_timing", "--permutations", 9, "--json", "--length", "none"]
+    (tmp_path / "c.yaml").write_text("scorer_params: {gripper_timing: {'on': nose}}\n")
+    told = curation("audit", told_data, *options, "--config", tmp_path / "c.yaml")
+    assert (told.code, told.out) == (USAGE, "")
+    assert "on is 'nose'" in told.err
+
+
 def test_number_to_keep_is_taken(curation: Run, told_data: Path) -> None:
     options = ["--scorers", "gripper_timing", "--permutations", 9, "--json", "--keep"]
     by_number = curation("audit", told_data, *options, "2").rows[0]
