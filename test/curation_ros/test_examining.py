@@ -252,3 +252,21 @@ def test_twins_are_fitted_on_the_dataset_itself(data: Path) -> None:
     assert curation.scoring_hash != before
     again = [e.result for e in Examiner(curation).run(bags_of(data))]
     assert all(isinstance(e, Examination) and e.scores["knn_label_free"] for e in again)
+
+
+def test_processes_that_score_at_once_agree(data: Path, tmp_path: Path) -> None:
+    config = tmp_path / "curation.yaml"
+    config.write_text(f"scorers: [{', '.join(SCORERS)}]\nrule: none\nrule_scorer: length\n")
+    command = [sys.executable, "-m", "curation_ros.cli.main", "score", str(data), "--json"]
+    command += ["--config", str(config)]
+    rebuild = [sys.executable, "-m", "curation_ros.cli.main", "index", str(data), "--rebuild"]
+    running = [
+        subprocess.Popen(c, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for c in (command, command, rebuild, command)
+    ]
+    outputs = [process.communicate() for process in running]
+    assert [process.returncode for process in running] == [0] * 4, outputs
+    assert [err for _, err in outputs] == [""] * 4
+    scored = {outputs[k][0] for k in (0, 1, 3)}
+    assert len(scored) == 1
+    assert scored.pop().count("\n") == N_BAGS
