@@ -12,6 +12,7 @@ from pathlib import Path
 
 BENCHMARKS = (
     "sim_speed",
+    "decoding",
     "graph_speed",
     "decision_latency",
     "recorder_loss",
