@@ -66,6 +66,11 @@ def test_json_is_a_line_a_scorer_with_exactly_the_keys(
     assert "NaN" not in told.out
 
 
+def test_every_key_stands_in_the_docs() -> None:
+    text = (Path(__file__).resolve().parents[3] / "docs" / "audit.md").read_text()
+    assert not [key for key in sorted(KEYS) if f"`{key}`" not in text]
+
+
 def test_table_shows_every_scorer_what_it_needs_and_the_paper(
     curation: Run, folder: Path, told_data: Path
 ) -> None:
