@@ -391,10 +391,10 @@ class _Job:
     def _unicode(
         self, raw: npt.NDArray[np.bytes_], rows: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.str_]:
-        try:
-            return raw.astype(np.str_)
-        except UnicodeDecodeError:
-            pass  # not ASCII
+        codes = np.ascontiguousarray(raw).view(np.uint8).reshape(len(raw), raw.itemsize)
+        if (codes < 0x80).all():  # ASCII: NumPy's own conversion takes ten times as long
+            texts: npt.NDArray[np.str_] = codes.astype(np.uint32).view(f"U{codes.shape[1]}")
+            return texts[:, 0]
         out = []
         for row, word in zip(rows.tolist(), raw.tolist(), strict=True):
             try:

@@ -53,6 +53,8 @@ class ColumnWalk:
         self._type_name = walk.type_name
         self._definitions = walk.definitions
         self._starts, self._sizes = messages.starts, messages.sizes
+        self._least_size = int(self._sizes.min())
+        self._views: dict[str, npt.NDArray[np.generic]] = {}
         self._buffer = messages.buffer
         if int((self._starts + self._sizes).max()) + _PADDING > len(self._buffer):
             self._buffer = np.concatenate([self._buffer, np.zeros(_PADDING, dtype=np.uint8)])
@@ -81,11 +83,16 @@ class ColumnWalk:
 
     def _read(self, at: _Place, code: str) -> npt.NDArray[np.generic]:
         """(n,) numbers at a place; of messages that end before it, any."""
-        places = self._starts + np.minimum(at, self._sizes)
-        values: npt.NDArray[np.generic] = rows_at(self._buffer, places, SIZES[code]).view(
-            self._order + code
-        )
-        return values[:, 0]
+        view = self._views.get(code)
+        if view is None:
+            # A number at every byte: picking from it copies only those that are wanted.
+            n_places = len(self._buffer) - SIZES[code] + 1
+            view = np.ndarray((n_places,), self._order + code, self._buffer, 0, (1,))
+            self._views[code] = view
+        if not isinstance(at, int) or at > self._least_size:
+            at = np.minimum(at, self._sizes)
+        values: npt.NDArray[np.generic] = view[self._starts + at]
+        return values
 
     def _align(self, size: int) -> None:
         self._at = self._at + -(self._at - 4) % size
@@ -131,9 +138,9 @@ class ColumnWalk:
 
     def _length(self) -> _Place:
         self._align(4)
-        counts = self._read(self._at, "I").astype(np.int64)
+        counts = self._read(self._at, "I")
         self._at = self._at + 4
-        return int(counts[0]) if (counts == counts[0]).all() else counts
+        return int(counts[0]) if (counts == counts[0]).all() else counts.astype(np.int64)
 
     def _text(self, field: Field) -> Leaves:
         length = self._length()
@@ -142,9 +149,12 @@ class ColumnWalk:
             self._at = start + length * 4
         else:
             self._at = start + length
-            ended = self._read(self._at - 1, "B") == 0
-            self.fits &= ended | (np.asarray(length) == 0)
-            length = length - np.minimum(length, 1)
+            if not isinstance(length, int):
+                self.fits &= (self._read(self._at - 1, "B") == 0) | (length == 0)
+                length = length - np.minimum(length, 1)
+            elif length:
+                self.fits &= self._read(self._at - 1, "B") == 0
+                length -= 1
         if field.text_bound:
             self.fits &= length <= field.text_bound
         return Leaves(TEXTS[field.base], start, length)
