@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 import logging
 import os
+import signal
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -115,6 +117,8 @@ class Examiner:
         from joblib import Parallel, delayed
         from joblib.externals.loky.process_executor import TerminatedWorkerError
 
+        # Who interrupts us does not ask what became of the batches ahead.
+        warnings.filterwarnings("ignore", "[0-9]+ tasks ", UserWarning)
         with _workers(self._backend, self._jobs):
             try:
                 if self._backend == "ray":
@@ -237,9 +241,10 @@ def _key(curation: Curation, topic_map: TopicMap | None) -> str:
 def _home(bag: Path) -> tuple[Path, str]:
     """Folder whose index has a bag (its dataset, or the folder around it), and its name there."""
     folder = bag.resolve().parent
+    name = os.fsencode(bag.name).decode(errors="backslashreplace")  # SQLite takes UTF-8 alone
     if folder.name == "episodes":
-        return folder.parent, f"episodes/{bag.name}"
-    return folder, bag.name
+        return folder.parent, f"episodes/{name}"
+    return folder, name
 
 
 def _stamp(bag: Path) -> str:
@@ -279,6 +284,17 @@ def _workers(backend: str, jobs: int) -> Iterator[None]:
 
 @contextmanager
 def _loky(jobs: int) -> Iterator[None]:
+    from joblib import Parallel, delayed, effective_n_jobs
+
+    # Ctrl-C goes to all processes of a terminal; we end the workers, and none of them is to print
+    # a traceback. What is blocked when they start stays so in them; here it waits for a moment.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        Parallel(n_jobs=jobs, backend="loky")(
+            delayed(int)() for _ in range(effective_n_jobs(jobs))
+        )
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     yield
 
 
@@ -350,8 +366,8 @@ class Copies:
 
 def with_copy(seen: Examination, original: tuple[str, str]) -> Examination:
     """An examination with the finding that another episode (id, name) has the same content."""
-    episode, name = original
-    message = f"same content as {name or episode[:8]} ({episode})"
+    # Its id alone: whether its name is known already depends on when one asks.
+    message = f"same content as episode {original[0]}"
     return replace(seen, findings=(*seen.findings, Finding("duplicate", message, seen.span)))
 
 
