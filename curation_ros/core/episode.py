@@ -69,7 +69,7 @@ class Episode:
                 f"episode {self.id}: no field {name!r}; it has {', '.join(self.fields) or 'none'}"
             ) from None
 
-    @property
+    @cached_property
     def rate_hz(self) -> float:
         """Rate of the recording, else median rate of the clock; NaN with fewer than two steps."""
         if self.sampled_hz is not None:

@@ -25,15 +25,19 @@ _EULER_GAMMA = 0.5772156649015329
 class Forest(NamedTuple):
     """Isolation trees as flat arrays: scored without scikit-learn, and hashable by content.
 
+    The nodes of all trees stand one behind the other; children are indices into that.
+
     Attributes:
-        feature: (trees, nodes) feature that a node splits on, -1 in a leaf.
-        threshold: (trees, nodes) go left where the feature is at most this.
-        left, right: (trees, nodes) children; a leaf is its own child.
-        depth: (trees, nodes) expected depth of a point that ends in this leaf.
+        root: (trees,) where each tree begins.
+        feature: (nodes,) feature that a node splits on, 0 in a leaf.
+        threshold: (nodes,) go left where the feature is at most this.
+        left, right: (nodes,) children; a leaf is its own child.
+        depth: (nodes,) expected depth of a point that ends in this leaf.
         levels: depth of the deepest tree.
         normaliser: number that the summed depth is divided by.
     """
 
+    root: npt.NDArray[np.int64]
     feature: npt.NDArray[np.int64]
     threshold: Floats
     left: npt.NDArray[np.int64]
@@ -45,12 +49,11 @@ class Forest(NamedTuple):
     def score(self, row: Floats) -> float:
         """scikit-learn's `score_samples` of one (F,) row: between -1 (isolated at once) and 0."""
         row = row.astype(np.float32).astype(np.float64)  # scikit-learn's trees compare float32
-        trees = np.arange(len(self.feature))
-        node = np.zeros(len(trees), dtype=np.int64)
+        node = self.root
         for _ in range(self.levels):
-            left = row[self.feature[trees, node]] <= self.threshold[trees, node]
-            node = np.where(left, self.left[trees, node], self.right[trees, node])
-        return -float(2.0 ** (-self.depth[trees, node].sum() / self.normaliser))
+            left = row.take(self.feature.take(node)) <= self.threshold.take(node)
+            node = np.where(left, self.left.take(node), self.right.take(node))
+        return -float(2.0 ** (-self.depth.take(node).sum() / self.normaliser))
 
 
 def _features(episode: Episode, of: str) -> Floats:
@@ -86,23 +89,11 @@ def _grow(table: Floats, n_trees: int, max_samples: int, seed: int) -> Forest:
         n_estimators=n_trees, max_samples=n_samples, random_state=seed
     ).fit(table)
     trees = [estimator.tree_ for estimator in forest.estimators_]
-    shape = (len(trees), max(t.node_count for t in trees))
-    grown = Forest(
-        feature=np.full(shape, -1, dtype=np.int64),
-        threshold=np.zeros(shape),
-        left=np.zeros(shape, dtype=np.int64),
-        right=np.zeros(shape, dtype=np.int64),
-        depth=np.zeros(shape),
-        levels=max(int(t.max_depth) for t in trees),
-        normaliser=len(trees) * float(_mean_search_length(np.array(float(n_samples)))),
-    )
-    for k, tree in enumerate(trees):
+    root = np.concatenate([[0], np.cumsum([t.node_count for t in trees[:-1]], dtype=np.int64)])
+    parts: list[tuple[Floats, ...]] = []
+    for tree, begin in zip(trees, root, strict=True):
         nodes = np.arange(tree.node_count)
         leaf = tree.children_left < 0
-        grown.feature[k, nodes] = np.where(leaf, -1, tree.feature)
-        grown.threshold[k, nodes] = tree.threshold
-        grown.left[k, nodes] = np.where(leaf, nodes, tree.children_left)
-        grown.right[k, nodes] = np.where(leaf, nodes, tree.children_right)
         depth = _mean_search_length(tree.n_node_samples.astype(np.float64))
         level, n_above = nodes[:1], 0
         while len(level):
@@ -110,8 +101,20 @@ def _grow(table: Floats, n_trees: int, max_samples: int, seed: int) -> Forest:
             inner = level[~leaf[level]]
             level = np.concatenate([tree.children_left[inner], tree.children_right[inner]])
             n_above += 1
-        grown.depth[k, nodes] = depth
-    return grown
+        children = [np.where(leaf, nodes, c) for c in (tree.children_left, tree.children_right)]
+        feature = np.where(leaf, 0, tree.feature)
+        parts.append((feature, tree.threshold, begin + children[0], begin + children[1], depth))
+    feature, threshold, left, right, depth = map(np.concatenate, zip(*parts, strict=True))
+    return Forest(
+        root=root,
+        feature=feature.astype(np.int64),
+        threshold=threshold,
+        left=left.astype(np.int64),
+        right=right.astype(np.int64),
+        depth=depth,
+        levels=max(int(t.max_depth) for t in trees),
+        normaliser=len(trees) * float(_mean_search_length(np.array(float(n_samples)))),
+    )
 
 
 class IsolationForest(Scorer):

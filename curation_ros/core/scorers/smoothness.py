@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from scipy import fft
 
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.scorers.features import moving_action
@@ -47,7 +48,7 @@ def spectral_arc_length(
     if not (np.isfinite(rate_hz) and rate_hz > 0):
         raise Abstain(f"the rate of the clock is {rate_hz} Hz")
     n_fft = 2 ** (int(np.ceil(np.log2(len(speed)))) + pad_level)
-    amplitude = np.abs(np.fft.rfft(speed, n_fft))
+    amplitude = np.abs(fft.rfft(speed, n_fft))
     if not amplitude.max() > 0:
         raise Abstain("the speed is zero throughout")
     frequency_hz = np.arange(len(amplitude)) * (rate_hz / n_fft)
@@ -57,7 +58,7 @@ def spectral_arc_length(
     if len(amplitude) < 2:
         raise Abstain(f"no spectrum below {cutoff_hz} Hz at {rate_hz:.3g} Hz")
     step = 1.0 / (len(amplitude) - 1)
-    return -float(np.sum(np.hypot(step, np.diff(amplitude))))
+    return -float(np.sum(np.sqrt(step**2 + np.diff(amplitude) ** 2)))
 
 
 class Smoothness(Scorer):

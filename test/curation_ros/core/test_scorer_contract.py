@@ -9,13 +9,17 @@ from typing import get_args
 import numpy as np
 import pytest
 from episodes import copied, make_episode, make_pool, moved, shifted, with_fields
+from streams import samples_of
 
+from curation_ros.bags import CdrDecoder
+from curation_ros.core.builder import EpisodeBuilder
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import EpisodeError, NotFittedError
 from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, Abstain, Need, PoolScorer, Scorer
 from curation_ros.core.scorers.ensemble import Ensemble
 from curation_ros.core.scorers.features import start_state
 from curation_ros.core.scorers.knn import NearestNeighbours
+from curation_ros.core.stream import Messages, SampleBlock
 
 NAMES = list(SCORERS)
 POOLED = [name for name in NAMES if SCORERS[name].needs == "dataset"]
@@ -135,6 +139,40 @@ def test_shift_of_all_stamps_changes_nothing(
     there = SCORERS[name]().fit([shifted(e, HOUR_NS) for e in reference])
     assert there.score(shifted(episode, HOUR_NS)) == here.score(episode)
     assert there.explain(shifted(episode, HOUR_NS)) == here.explain(episode)
+
+
+def test_live_equals_bag(fitted: Scorer, rng: np.random.Generator) -> None:
+    # A bag in one block a topic, a live stream message by message, asked for in between.
+    made = make_episode(rng, open_at=140)
+    samples = samples_of(made)
+
+    def builder() -> EpisodeBuilder:
+        return EpisodeBuilder(
+            made.topic_map,
+            CdrDecoder(),
+            episode_id=made.id,
+            name=made.name,
+            start_ns=made.start_ns,
+        )
+
+    live, bag = builder(), builder()
+    for k, sample in enumerate(samples):
+        live.push(sample)
+        if k % 500 == 499:
+            live.partial()
+    for topic in made.topic_map.topics:
+        of_topic = [s for s in samples if s.topic == topic]
+        bag.push_block(
+            SampleBlock(
+                topic,
+                np.array([s.stamp_ns for s in of_topic]),
+                np.array([s.seq for s in of_topic]),
+                Messages.joined([s.data for s in of_topic]),
+            )
+        )
+    seen = live.finish(made.end_ns, {})
+    assert fitted.score(seen) == fitted.score(bag.finish(made.end_ns, {}))
+    assert fitted.score(seen) == fitted.score(made)
 
 
 def degenerate(kind: str) -> Episode:
