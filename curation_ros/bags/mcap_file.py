@@ -490,6 +490,16 @@ class MessageBlock(NamedTuple):
     publish_times_ns: npt.NDArray[np.int64]
     messages: Messages
 
+    def take(self, rows: npt.NDArray[np.int64] | slice) -> MessageBlock:
+        """Some of the messages; for a slice without a copy."""
+        return MessageBlock(
+            self.channels[rows],
+            self.sequences[rows],
+            self.log_times_ns[rows],
+            self.publish_times_ns[rows],
+            self.messages.take(rows),
+        )
+
 
 def read_blocks(path: Path, info: McapInfo, channels: Collection[int]) -> Iterator[MessageBlock]:
     """Read the messages of some channels, many at once; chunks without any are not unpacked.

@@ -66,7 +66,7 @@ class Messages:
         start = int(self.starts[row])
         return self.buffer[start : start + int(self.sizes[row])].tobytes()
 
-    def take(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> Messages:
+    def take(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice) -> Messages:
         """Some of the messages, in the same buffer."""
         return Messages(self.buffer, self.starts[rows], self.sizes[rows])
 
