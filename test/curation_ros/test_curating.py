@@ -695,6 +695,6 @@ def test_copy_that_is_played_live_is_found(dataset: Dataset) -> None:
     copy = replace(first, id="00000000-0000-7000-8000-00000000ffff", name="copy")
     [decided] = _watch(live, copy, samples_of(copy))
     assert decided.decision.verdict == "review"
-    assert decided.decision.reason.startswith(f"duplicate: same content as {first.id[:8]}")
+    assert decided.decision.reason.startswith(f"duplicate: same content as episode {first.id}")
     record(dataset, copy)
     assert live.bag_closed(copy.id) == []  # equal to the bag, copy or not

@@ -211,7 +211,7 @@ def test_copy_of_an_episode_is_found_whatever_it_is_called(data: Path, fitted: C
     judged = list(judge_bags(Examiner(fitted), fitted, bags_of(data)))
     copies = [d for _, d in judged if d and any(f.id == "duplicate" for f in d.findings)]
     assert [(d.name, d.verdict) for d in copies] == [("again", "review")]
-    assert copies[0].reason == f"duplicate: same content as first ({original.id})"
+    assert copies[0].reason == f"duplicate: same content as episode {original.id}"
 
 
 def test_copies_are_told_by_content_alone() -> None:

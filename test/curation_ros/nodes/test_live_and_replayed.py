@@ -55,7 +55,7 @@ def unknown_phase(take: Take) -> Take:
 #: Name -> (take, findings that it must have).
 TAKES = {
     "clean": (lambda: libero_take(1), set()),
-    "early_release": (lambda: libero_take(2, open_at=70), set()),
+    "early_release": (lambda: libero_take(2, open_at=70), {"opened-early"}),
     "repeated": (lambda: repeated(libero_take(3)), set()),
     "interleaved": (lambda: interleaved(libero_take(4), np.random.default_rng(0)), set()),
     "no_counts": (lambda: libero_take(5, counts=False), set()),
@@ -100,8 +100,8 @@ class Session:
 
     def record_stalls(self, robot: Robot) -> None:
         """Stop the curator in mid-episode, and let it go on within the episode or after it."""
-        for name in STALLS:
-            take = self.takes[name] = libero_take(20, LONG_STEPS if name == "overflow" else 120)
+        for seed, name in enumerate(STALLS, 20):
+            take = self.takes[name] = libero_take(seed, LONG_STEPS if name == "overflow" else 120)
             first, most = take.until(0.02), take.until(0.98)
             robot.tell(take.started)
             robot.send(take.messages[:first])
