@@ -410,7 +410,8 @@ def _task(
             found.append(Finding("opened-early", f"the gripper opened {text}", span))
     reached = facts.last_phase
     wanted = len(labels) - 1 if baseline is None else baseline.last_phase_
-    if labels and 0 <= reached < wanted:
+    is_known = facts.phase is not None and bool((facts.phase >= 0).all())
+    if is_known and reached < wanted:
         text = f"it ends in phase {labels[reached]} at most, expected {labels[wanted]}"
         found.append(Finding("unfinished", text, episode.span(last, last)))
     elif facts.closes and facts.opening is None and baseline is not None and baseline.opens_:

@@ -526,6 +526,12 @@ def test_last_phase_that_is_not_reached_is_unfinished(rng: np.random.Generator) 
     assert _ids(cut, handed_over) == []
 
 
+def test_unknown_phases_do_not_tell_whether_it_was_finished() -> None:
+    whole = make_episode()
+    assert _ids(_set(whole.steps(OPEN_AT), "phase", slice(180, None), -1.0)) == []
+    assert _ids(_set(whole, "phase", slice(None), -1.0)) == []
+
+
 def test_gripper_that_stays_closed_is_unfinished_where_references_open(
     rng: np.random.Generator, baseline: Baseline
 ) -> None:
