@@ -18,6 +18,7 @@ BENCHMARKS = (
     "recorder_loss",
     "kill_cost",
     "many_episodes",
+    "scorer_cost",
 )
 
 

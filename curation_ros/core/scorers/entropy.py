@@ -25,7 +25,12 @@ class Entropy(Scorer):
     choices: ClassVar = {"over": ("dimensions", "values")}
 
     def __init__(self, *, over: str = "dimensions", gripper_channel: bool = True) -> None:
-        """Store what is averaged, and whether the gripper counts."""
+        """Store the parameters.
+
+        Args:
+            over: whether deviations of dimensions are averaged, or one is taken of all values.
+            gripper_channel: whether the command of the gripper is part of the action.
+        """
         self.over = over
         self.gripper_channel = gripper_channel
 

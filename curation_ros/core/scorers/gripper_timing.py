@@ -39,7 +39,12 @@ class GripperTiming(Scorer):
     choices: ClassVar = {"on": ("command", "fingers"), "never": ("latest", "abstain")}
 
     def __init__(self, *, on: str = "command", never: str = "latest") -> None:
-        """Store what counts as an opening, and what one counts that never comes."""
+        """Store the parameters.
+
+        Args:
+            on: whose opening counts, the command's or the measured fingers'.
+            never: what an episode scores that never opens again: 1 (`latest`) or nothing.
+        """
         self.on = on
         self.never = never
 

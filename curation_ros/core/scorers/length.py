@@ -25,7 +25,11 @@ class Length(Scorer):
     choices: ClassVar = {"of": ("steps", "path")}
 
     def __init__(self, *, of: str = "steps") -> None:
-        """Store what is measured."""
+        """Store the parameters.
+
+        Args:
+            of: what is measured: steps, or the path of the effector.
+        """
         self.of = of
         self.resolution = 0.01 if of == "path" else 1.0
 

@@ -53,7 +53,11 @@ class TrajectoryAlignment(Scorer):
     choices: ClassVar = {"of": ("time-mean", "flattened")}
 
     def __init__(self, *, of: str = "time-mean") -> None:
-        """Store what is compared."""
+        """Store the parameters.
+
+        Args:
+            of: what is compared: the mean over time of the states, or all of them in a row.
+        """
         self.of = of
 
     def fit(self, episodes: Sequence[Episode]) -> Self:
@@ -106,7 +110,7 @@ class LabelFreeTrajectoryAlignment(PoolScorer):
         """Store the parameters.
 
         Args:
-            of: what is compared.
+            of: what is compared: the mean over time of the states, or some of them in a row.
             n_points: steps that are compared with `of='flattened'`.
             same_start: starts that differ by no more than this in any number are the same.
             min_others: episodes of other starts that it takes to judge one.
