@@ -64,6 +64,8 @@ _SMALL_CHUNK_BYTES, _MAX_COMPRESSION = 16 << 20, 1000
 # stay in the cache of a processor while they are decoded.
 _SMALL_BYTES = 4 << 20
 _BLOCK_BYTES = 1 << 20
+# How many times the bytes of its messages a block may keep in memory.
+_MOST_UNWANTED = 8
 # Schemas and channels up to this size are kept, as the next bag is likely to have them, too.
 _COMMON_BYTES = 16 << 10
 _FOREIGN = {
@@ -703,12 +705,15 @@ def _split_by_index(
     if not wanted.issuperset(channel for _, channel, raw in parts if raw):
         rows = np.isin(channels, list(wanted))
         heads, channels, starts, sizes = heads[rows], channels[rows], starts[rows], sizes[rows]
+    messages = Messages(buffer, starts, sizes)
+    if len(buffer) > _MOST_UNWANTED * int(sizes.sum()):
+        messages = messages.compact()  # else some poses would keep the images beside them
     return MessageBlock(
         channels.astype(np.int64),
         heads["sequence"].astype(np.int64),
         heads["log_ns"].astype(np.int64),
         heads["publish_ns"].astype(np.int64),
-        Messages(buffer, starts, sizes),
+        messages,
     )
 
 

@@ -22,6 +22,7 @@ from bag_messages import (
     episode_messages,
     make,
     pose,
+    status,
     to_cdr,
     twist,
     write_bag,
@@ -39,6 +40,7 @@ from curation_ros.bags import (
     recover_bag,
 )
 from curation_ros.bags.mcap_file import read_info
+from curation_ros.core.builder import EpisodeBuilder
 from curation_ros.core.errors import BagError, ConfigError
 from curation_ros.core.topic_map import TopicMap, topic_map_from_json
 
@@ -180,6 +182,37 @@ def test_samples_are_the_messages_in_file_order(tmp_path: Path) -> None:
             for k in range(len(b.messages))
         ]
         assert found == [sample for sample in expected if sample[0] == topic]
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+@pytest.mark.parametrize("flush_every", [1, 7, 1000])
+def test_episode_of_a_bag_is_that_of_its_samples_one_by_one(
+    tmp_path: Path, compression: str, flush_every: int
+) -> None:
+    rng = np.random.default_rng(flush_every)
+    messages = episode_messages(30)
+    # Late, lost, repeated and spoilt messages.
+    order = np.argsort(np.arange(len(messages)) + rng.normal(0, 4, len(messages)))
+    messages = [messages[k] for k in order if rng.random() > 0.03]
+    messages += [messages[int(k)] for k in rng.integers(0, len(messages), 5)]
+    spoilt_ns = START_NS + 3 * STEP_NS
+    messages.append(("/phase", spoilt_ns, status(spoilt_ns, "GRASP", {})))
+    options = {"compression": compression, "flush_every": flush_every}
+    write_bag(tmp_path / "ep", messages, custom_data=_custom_data(30), **options)
+    bag = open_bag(tmp_path / "ep")
+    event = bag.event()
+    assert event is not None
+    assert event.end_ns is not None
+    builder = EpisodeBuilder(
+        _topic_map(), bag.decoder(), episode_id=event.id, name=event.name, start_ns=event.start_ns
+    )
+    for sample in bag.samples(_topic_map()):
+        builder.push(sample)
+    expected = builder.finish(event.end_ns, event.counts)
+    episode = read_episode(tmp_path / "ep")
+    assert episode.digest == expected.digest
+    assert episode.findings == expected.findings
+    assert {f.id for f in episode.findings} >= {"clock-back", "incomplete", "undecodable"}
 
 
 def test_one_topic_may_feed_two_of_the_map_and_come_on_two_channels(tmp_path: Path) -> None:

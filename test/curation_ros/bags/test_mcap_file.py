@@ -135,6 +135,16 @@ def test_blocks_end_after_many_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert _read(path, info, {1, 2}) == _walked(path, {1, 2})
 
 
+def test_small_messages_do_not_keep_the_large_ones_beside_them(tmp_path: Path) -> None:
+    sizes = [10, 5000] * 20
+    shape = _Shape([0, 1] * 20, sizes, 1 << 20, CompressionType.ZSTD, IndexType.ALL)
+    path = tmp_path / "a.mcap"
+    path.write_bytes(_file(shape))
+    [block] = read_blocks(path, read_info(path), {1})
+    assert len(block.messages.buffer) == 200
+    assert _read(path, read_info(path), {1}) == _walked(path, {1})
+
+
 def test_a_file_that_shrinks_after_it_was_opened_is_an_error(tmp_path: Path) -> None:
     shape = _Shape([0, 1] * 30, [20] * 60, 200, CompressionType.NONE, IndexType.ALL)
     path = tmp_path / "a.mcap"
