@@ -15,7 +15,8 @@ from curation_ros.core.decisions import CURATOR, Decision, in_force
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import CurationError, EpisodeError
 from curation_ros.core.gate import Closed, EpisodeGate
-from curation_ros.core.scoring import Curation, Ruling
+from curation_ros.core.judgement import Ruling
+from curation_ros.core.scoring import Curation
 from curation_ros.core.status import EpisodeEvent, owner_findings
 from curation_ros.core.stream import Decoder, Sample
 from curation_ros.core.topic_map import TopicMap

@@ -24,7 +24,8 @@ from curation_ros.core.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.examination import Examination
 from curation_ros.core.findings import Finding
-from curation_ros.core.scoring import Curation, Ruling
+from curation_ros.core.judgement import Ruling
+from curation_ros.core.scoring import Curation
 from curation_ros.core.selection import TieKey
 from curation_ros.core.topic_map import TopicMap
 from curation_ros.index import Index

@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import math
-import struct
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from curation_ros.core.checks import Baseline, check_episode
-from curation_ros.core.decisions import CURATOR, Decision, decide, untrustworthy
+from curation_ros.core.decisions import CURATOR, Decision, untrustworthy
 from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
 from curation_ros.core.examination import Examination, Part
 from curation_ros.core.findings import Finding
 from curation_ros.core.gripper import gripper_findings
+from curation_ros.core.judgement import Ruling, decide
 from curation_ros.core.length_control import LengthControl
 from curation_ros.core.rules import RULES, Rule
 from curation_ros.core.salvage import sound_part
 from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, PoolScorer, Scorer
 from curation_ros.core.scorers.features import phase_name
 from curation_ros.core.selection import TieKey
+from curation_ros.core.state_hash import state_hash
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -37,26 +35,6 @@ _BY_GRIPPER = ("clipped-start", "never-grasped", "opened-early", "unfinished")
 _STATE_VERSION = 2
 #: References are scored by scorers that were fitted without them; above this many, in groups.
 _MAX_FOLDS = 20
-
-
-@dataclass(frozen=True)
-class Ruling:
-    """A fitted rule, and what it has seen.
-
-    Attributes:
-        rule: None where it could not be fitted.
-        no_rule: why not.
-        basis: `provisional` where the dataset that it was fitted on may still grow.
-        fitted_on: what it has seen: `what` (nothing, reference, dataset), number of `episodes`,
-            and a `hash` over their ids and scores.
-        state_hash: of scorers and rule with all that they have learned.
-    """
-
-    rule: Rule | None
-    no_rule: str
-    basis: Literal["final", "provisional"]
-    fitted_on: Mapping[str, Any] = field(default_factory=dict)
-    state_hash: str = ""
 
 
 class Curation:
@@ -318,7 +296,6 @@ class Curation:
         basis: Literal["final", "provisional"],
         seen: Mapping[str, Any],
     ) -> Ruling:
-        digest = hashlib.sha256()
         state = {
             "scoring": self.scoring_hash_,
             "name": self.rule,
@@ -327,8 +304,7 @@ class Curation:
             "fitted": rule.fitted() if rule is not None else no_rule,
             "seen": dict(seen),
         }
-        _feed(digest, state)
-        return Ruling(rule, no_rule, basis, dict(seen), digest.hexdigest())
+        return Ruling(rule, no_rule, basis, dict(seen), state_hash(state))
 
     def _reference_scores(self, name: str, episodes: Sequence[Episode]) -> dict[str, float]:
         """Id -> score of the reference, each by a scorer that was fitted without that episode."""
@@ -539,9 +515,7 @@ class Curation:
             "reference": self.reference_ids_,
             "dataset": self.dataset_ids_,
         }
-        digest = hashlib.sha256()
-        _feed(digest, state)
-        return digest.hexdigest()
+        return state_hash(state)
 
     def describe(self) -> str:
         """For people: what scores, what each scorer needs, and what decides.
@@ -577,9 +551,7 @@ class Curation:
 
 def _seen(what: str, scores: Mapping[str, float]) -> dict[str, Any]:
     """What a rule was fitted on, as plain JSON."""
-    digest = hashlib.sha256()
-    _feed(digest, scores)
-    return {"what": what, "episodes": len(scores), "hash": digest.hexdigest()}
+    return {"what": what, "episodes": len(scores), "hash": state_hash(scores)}
 
 
 def _fits(value: object, default: object) -> bool:
@@ -611,35 +583,3 @@ def _check_reference(episodes: Sequence[Episode]) -> None:
             refused.append(f"{episode.name} ({episode.id}): {faults[0].id}: {faults[0].message}")
     if refused:
         raise EpisodeError(f"reference refused: {'; '.join(refused)}")
-
-
-def _feed(digest: Any, value: object) -> None:
-    """Feed a value to a hash, with its type, so that no two states look alike.
-
-    Raises:
-        TypeError: for a type without a canonical form.
-    """
-    if isinstance(value, Mapping):
-        digest.update(f"map{len(value)}".encode())
-        for key in sorted(value):
-            _feed(digest, key)
-            _feed(digest, value[key])
-    elif isinstance(value, (list, tuple)):
-        digest.update(f"seq{len(value)}".encode())
-        for item in value:
-            _feed(digest, item)
-    elif isinstance(value, np.ndarray):
-        kind = "<f8" if value.dtype.kind == "f" else "<i8"
-        digest.update(f"arr{kind}{value.shape}".encode())
-        digest.update(value.astype(kind).tobytes())
-    elif value is None or isinstance(value, (bool, np.bool_)):
-        digest.update(f"lit{value}".encode())
-    elif isinstance(value, (int, np.integer)):
-        digest.update(f"int{int(value)};".encode())
-    elif isinstance(value, (float, np.floating)):
-        digest.update(b"flt" + struct.pack("<d", value))
-    elif isinstance(value, str):
-        text = value.encode()
-        digest.update(f"str{len(text)};".encode() + text)
-    else:
-        raise TypeError(f"no canonical form for {type(value).__name__}")
