@@ -40,7 +40,7 @@ FINDINGS: dict[str, tuple[Kind, str]] = {
     "clock-back": ("recording", "stamps of a topic went back inside the episode"),
     "duplicate-stamp": ("recording", "two samples of one topic and stamp have different values"),
     "gap": ("recording", "a topic was silent for longer than max_gap_s"),
-    "gripper-meaning": ("recording", "the fingers contradict the declared meaning of the gripper"),
+    "gripper-meaning": ("recording", "the data contradict the declared meaning of the gripper"),
     "incomplete": ("recording", "fewer samples than the owner of the episode counted"),
     "missing-topic": ("recording", "a mapped topic has no sample"),
     "no-bag": ("recording", "the bag could not be read; the live episode stands"),

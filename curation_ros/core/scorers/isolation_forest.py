@@ -240,6 +240,7 @@ class LabelFreeIsolationForest(PoolScorer):
         )
 
     def _judge(self, features: Floats, model: int) -> float:
+        """Between -1 and 0; an episode that nothing tells from the others is near -0.4."""
         forest = self.forests_[model]
         assert forest is not None  # min_others >= 2
         return forest.score(features)

@@ -170,6 +170,7 @@ class LabelFreeNearestNeighbours(PoolScorer):
         self.table_ = features
 
     def _judge(self, features: Floats, model: int) -> float:
+        """0 amid the others, more negative further away; in standard deviations."""
         # The mean cancels: only the scale is left in the difference of two standardised rows.
         others = self.table_[self.fold_ != model]  # the last model is no fold: all
         distance = np.linalg.norm((others - features) / self.scale_[model], axis=1)

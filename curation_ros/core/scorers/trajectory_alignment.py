@@ -141,4 +141,5 @@ class LabelFreeTrajectoryAlignment(PoolScorer):
         )
 
     def _judge(self, features: Floats, model: int) -> float:
+        """1 for the same direction, 0 for a right angle, -1 for the opposite."""
         return _cosine(features, self.mean_[model])
