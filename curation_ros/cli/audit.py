@@ -18,6 +18,7 @@ from curation_ros.auditing import (
     audit,
     read_episodes,
 )
+from curation_ros.cli.arguments import add_config, add_reference
 from curation_ros.cli.output import console, print_json, say, warn
 from curation_ros.configuration import read_curation, read_reference, share_file
 from curation_ros.core.errors import ConfigError
@@ -31,15 +32,7 @@ Column: TypeAlias = Callable[[Mapping[str, Any]], str]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("dataset", type=Path)
-    parser.add_argument(
-        "--reference",
-        nargs="+",
-        action="extend",
-        type=Path,
-        default=[],
-        metavar="DIR",
-        help="trusted demonstrations: datasets or bags",
-    )
+    add_reference(parser)
     parser.add_argument(
         "--labels",
         choices=tuple(LABELS),
@@ -65,12 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--permutations", type=int, default=9999, help="default 9999")
     parser.add_argument("--seed", type=int, default=0, help="of permutations and bootstrap")
-    parser.add_argument(
-        "--config", type=Path, help="parameters of scorers; default config/curation.yaml"
-    )
-    parser.add_argument(
-        "--topic-map", type=Path, help="default: the one that is stored in the bag"
-    )
+    add_config(parser)
 
 
 def run(args: argparse.Namespace) -> int:

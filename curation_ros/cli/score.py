@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from curation_ros.bags.reader import find_bags
+from curation_ros.cli.arguments import add_config, add_reference
 from curation_ros.cli.output import VERDICT_STYLE, console, print_json, progress_console, warn
 from curation_ros.configuration import read_curation, read_reference, share_file
 from curation_ros.core.decisions import Decision
@@ -37,15 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "paths", nargs="+", type=Path, metavar="PATH", help="datasets, bags, .mcap"
     )
-    parser.add_argument(
-        "--reference",
-        nargs="+",
-        action="extend",
-        type=Path,
-        default=[],
-        metavar="PATH",
-        help="datasets or bags of trusted demonstrations",
-    )
+    add_reference(parser)
     parser.add_argument(
         "--scorers",
         help=f"comma separated, beside the one that decides: {', '.join(SCORERS)}",
@@ -55,12 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--rule-scorer", help="the scorer that decides, likewise")
     parser.add_argument("--value", type=float, help="of --rule: a threshold, share or number")
-    parser.add_argument(
-        "--config", type=Path, help="scorers and rule; default config/curation.yaml"
-    )
-    parser.add_argument(
-        "--topic-map", type=Path, help="default: the one that is stored in the bag"
-    )
+    add_config(parser)
     parser.add_argument(
         "--write", action="store_true", help="log the decisions in the dataset (one PATH)"
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from curation_ros.cli.arguments import add_config, add_reference
 from curation_ros.cli.output import print_json, say
 from curation_ros.configuration import read_curation, share_file
 from curation_ros.core.scorers import SCORERS
@@ -18,23 +19,8 @@ _PROVEN, _DIFFERS = 0, 1
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("dataset", type=Path)
-    parser.add_argument(
-        "--reference",
-        nargs="+",
-        action="extend",
-        type=Path,
-        default=[],
-        metavar="DIR",
-        help="trusted demonstrations: datasets or bags",
-    )
-    parser.add_argument(
-        "--config",
-        type=Path,
-        help="rule and parameters; default config/curation.yaml. All scorers are checked",
-    )
-    parser.add_argument(
-        "--topic-map", type=Path, help="default: the one that is stored in the bag"
-    )
+    add_reference(parser)
+    add_config(parser)
 
 
 def run(args: argparse.Namespace) -> int:
