@@ -10,8 +10,10 @@ be checked in the chunk: with the few records between them, its messages must ti
 
 from __future__ import annotations
 
+import errno
 import functools
 import os
+import stat
 import struct
 import threading
 import zlib
@@ -115,6 +117,23 @@ class TornFileError(BagError):
         return type(self), (self.path, self.reason, self.finding)
 
 
+def open_now(path: Path) -> BinaryIO:
+    """Open a file to read it; one that is no plain file, such as a pipe, is never waited for.
+
+    Raises:
+        OSError: if it cannot be opened, or is no plain file.
+    """
+    stream = open(path, "rb", opener=_open_without_waiting)  # noqa: SIM115 - the caller closes it
+    if stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+        return stream
+    stream.close()
+    raise OSError(errno.EINVAL, "not a plain file")
+
+
+def _open_without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
 def open_mcap(path: Path) -> BinaryIO:
     """Open a file that begins as MCAP does.
 
@@ -122,7 +141,7 @@ def open_mcap(path: Path) -> BinaryIO:
         BagError: if it cannot be opened, is empty, or is something else, saying what.
     """
     try:
-        stream = path.open("rb")
+        stream = open_now(path)
         start = stream.read(32)
     except OSError as err:
         gone = isinstance(err, FileNotFoundError)

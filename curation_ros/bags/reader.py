@@ -23,13 +23,14 @@ from curation_ros.bags.mcap_file import (
     Message,
     MessageBlock,
     TornFileError,
+    open_now,
     read_blocks,
     read_info,
     walk,
 )
 from curation_ros.bags.recovery import custom_data_of
 from curation_ros.bags.writer import own_metadata
-from curation_ros.bags.yaml_text import load_yaml
+from curation_ros.bags.yaml_text import MOST_BYTES, load_yaml
 from curation_ros.core.builder import EpisodeBuilder
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import BagError, ConfigError, EpisodeError
@@ -296,7 +297,7 @@ class Bag:
         text = self.custom_data.get(key, "{}")
         try:
             raw = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             raw = None
         if not isinstance(raw, dict):
             raise BagError(
@@ -311,7 +312,7 @@ def _stored_topic_map(text: str) -> TopicMap:
     """The map that the bags of a dataset have in common."""
     try:
         raw = json.loads(text)
-    except ValueError as err:
+    except (ValueError, RecursionError) as err:
         raise ConfigError(f"its topic map is {text[:40]!r}, expected JSON") from err
     return topic_map_from_json(raw, "its topic map")
 
@@ -361,7 +362,7 @@ _Opened: TypeAlias = tuple[tuple[Path, ...], tuple[McapInfo, ...], dict[str, str
 def _open_own(folder: Path) -> _Opened | None:
     """Open a folder as our writer left it, without parsing YAML; None for any other."""
     try:
-        content = (folder / "metadata.yaml").read_bytes()
+        content = _metadata_bytes(folder)
         [file] = [entry.path for entry in os.scandir(folder) if entry.name.endswith(".mcap")]
         info = _checked_info(Path(file))
     except (OSError, ValueError, BagError):
@@ -378,7 +379,7 @@ def _own_custom_data(info: McapInfo) -> dict[str, str] | None:
     """custom_data as our writer noted it in the file; None where it did not."""
     try:
         raw = json.loads((info.own or {}).get("custom_data", ""))
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return {str(k): str(v) for k, v in raw.items()} if isinstance(raw, dict) else None
 
@@ -402,11 +403,17 @@ def _open_any(path: Path) -> _Opened:
     return mcap_paths, infos, custom_data
 
 
+def _metadata_bytes(folder: Path) -> bytes:
+    """The text of metadata.yaml, or its beginning where it is too large to be metadata."""
+    with open_now(folder / "metadata.yaml") as file:
+        return file.read(MOST_BYTES + 1)
+
+
 def _read_metadata_file(folder: Path) -> dict[str, Any] | None:
     """Contents of metadata.yaml; None where it is missing or spoilt: the files say the same."""
     path = folder / "metadata.yaml"
     try:
-        raw = load_yaml(path.read_bytes())
+        raw = load_yaml(_metadata_bytes(folder))
     except FileNotFoundError:
         return None
     except OSError as err:
@@ -423,13 +430,13 @@ def _listed_files(folder: Path, metadata: Mapping[str, Any]) -> tuple[Path, ...]
     storage = metadata.get("storage_identifier", "mcap")
     if storage not in ("mcap", ""):
         raise BagError(
-            f"{folder}: storage {storage!r} cannot be read, expected mcap; convert it with "
+            f"{folder}: storage {storage!r:.80} cannot be read, expected mcap; convert it with "
             "rosbags-convert or `ros2 bag convert`",
             finding="foreign-format",
         )
     if metadata.get("compression_mode"):
         raise BagError(
-            f"{folder}: compression mode {metadata['compression_mode']!r} cannot be read, "
+            f"{folder}: compression mode {metadata['compression_mode']!r:.80} cannot be read, "
             "expected MCAP's own compression of chunks; convert it with rosbags-convert",
             finding="unsupported-compression",
         )

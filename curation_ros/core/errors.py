@@ -15,9 +15,19 @@ class CurationError(Exception):
 
     def __init__(self, *args: object, finding: str = "") -> None:
         """Make an error of its message and, where one fits, the id of a finding."""
-        super().__init__(*args)
+        super().__init__(*(_one_line(a) if isinstance(a, str) else a for a in args))
         if finding:
             self.finding = finding
+
+
+def _one_line(text: str) -> str:
+    """The text with line breaks and what else a terminal would obey written as escapes.
+
+    Names of topics and files come from strangers.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 class ConfigError(CurationError):

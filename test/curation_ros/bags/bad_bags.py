@@ -508,6 +508,7 @@ class _Channel:
 def _foreign(
     *channels: _Channel,
     profile: str = "ros2",
+    noted: str | None = None,
     map_: Callable[[dict[str, Any]], None] = lambda raw: None,
     **options: Any,
 ) -> Callable[[Bench, Path], Path]:
@@ -518,19 +519,21 @@ def _foreign(
         raw["fields"] = {"eef_position": raw["fields"]["eef_position"]}
         raw = {"fields": raw["fields"], "state": ["eef_position"]}
         map_(raw)
-        noted = json.dumps({"custom_data": {"topic_map": json.dumps(raw)}})
+        text = noted or json.dumps({"custom_data": {"topic_map": json.dumps(raw)}})
         file = path.with_suffix(".mcap")
         with file.open("wb") as stream:
             writer = Writer(stream, **options)
             writer.start(profile=profile)
-            writer.add_metadata("rosbag2", {"serialized_metadata": noted})
+            writer.add_metadata("rosbag2", {"serialized_metadata": text})
             for channel in channels or (_Channel(),):
-                text = channel.text
-                if text is None:
-                    text = message_schema(channel.type).text.encode()
+                definition = channel.text
+                if definition is None:
+                    definition = message_schema(channel.type).text.encode()
                 schema = 0
                 if channel.has_schema:
-                    schema = writer.register_schema(channel.type, channel.schema_encoding, text)
+                    schema = writer.register_schema(
+                        channel.type, channel.schema_encoding, definition
+                    )
                 channel_id = writer.register_channel(channel.topic, channel.encoding, schema)
                 stamped = _of(bench.samples, EEF)
                 messages = channel.messages or tuple(s.data for s in stamped)
@@ -542,6 +545,14 @@ def _foreign(
     return make
 
 
+#: Eight lines that stand for 10**8 values.
+_UNFOLDING = "\n".join(
+    [
+        "a0: &a0 [" + ", ".join("0" * 10) + "]",
+        *(f"a{k}: &a{k} [" + ", ".join([f"*a{k - 1}"] * 10) + "]" for k in range(1, 8)),
+        "custom_data: {topic_map: *a7}",
+    ]
+)
 _POINT = "geometry_msgs/msg/PointStamped"
 
 
@@ -593,6 +604,26 @@ def _link(target: str) -> Callable[[Bench, Path], Path]:
         return link
 
     return make
+
+
+def _fifo_in_a_bag(bench: Bench, path: Path) -> Path:
+    path.mkdir()
+    os.mkfifo(path / "a_0.mcap")
+    return path
+
+
+def _fifo_of_metadata(bench: Bench, path: Path) -> Path:
+    bench.bag(path)
+    (path / "metadata.yaml").unlink()
+    os.mkfifo(path / "metadata.yaml")
+    return path
+
+
+def _sparse_metadata(bench: Bench, path: Path) -> Path:
+    path.mkdir()
+    with (path / "metadata.yaml").open("wb") as file:
+        file.truncate(HUGE_BYTES)
+    return path
 
 
 def _fifo(bench: Bench, path: Path) -> Path:
@@ -851,6 +882,8 @@ BAD: dict[str, tuple[Make, str]] = {
         "bad-config",
     ),
     "id-of-another-folder": (_wrong_id, "wrong-id"),
+    "event-nested-too-deep": (_custom(episode="[" * 100_000), "bad-metadata"),
+    "map-nested-too-deep": (_custom(topic_map='{"a":' * 100_000), "bad-metadata"),
     "no-topic-map": (_no_map, "no-topic-map"),
     # whole files
     "empty-file": (_file(lambda _: b""), "empty-file"),
@@ -971,6 +1004,10 @@ BAD: dict[str, tuple[Make, str]] = {
         _foreign(_Channel(topic="/other"), _Channel(encoding="json")),
         "foreign-encoding",
     ),
+    "topic-that-writes-on-the-terminal": (
+        _foreign(_Channel(topic="/a\n\x1b[2Jeef_pose", encoding="json")),
+        "foreign-encoding",
+    ),
     "profile-of-ros-1": (_foreign(profile="ros1"), "foreign-encoding"),
     "schema-of-garbage": (
         _foreign(_Channel(text=b"std_msgs/Header header\n??? pose")),
@@ -1031,6 +1068,15 @@ BAD: dict[str, tuple[Make, str]] = {
     "link-to-nowhere": (_link("nowhere"), "missing-file"),
     "link-to-itself": (_link("{name}"), "missing-file"),
     "pipe": (_fifo, "missing-file"),
+    "pipe-in-a-bag": (_fifo_in_a_bag, "unreadable"),
+    "pipe-for-metadata": (_fifo_of_metadata, "unreadable"),
+    "sparse-metadata-file": (_sparse_metadata, "missing-file"),
+    "metadata-that-unfolds": (_foreign(noted=_UNFOLDING), "no-topic-map"),
+    "metadata-without-end": (_foreign(noted="a: &a [*a]\ncustom_data: *a"), "no-topic-map"),
+    "metadata-nested-too-deep": (
+        _folder({"metadata.yaml": b"[" * 100_000}),
+        "missing-file",
+    ),
     "not-allowed": (_unreadable, "unreadable"),
     "name-that-is-not-utf-8": (_not_utf8, "truncated"),
     "csv-file": (_named(".csv", b"t,x,y\n0,1,2\n"), "not-mcap"),

@@ -18,6 +18,7 @@ from streams import record
 
 from curation_ros.bags import find_bags, read_episode
 from curation_ros.bags.mcap_file import TornFileError
+from curation_ros.bags.yaml_text import load_yaml
 from curation_ros.cli.main import main
 from curation_ros.core.checks import Baseline, check_episode
 from curation_ros.core.errors import BagError, ConfigError, CurationError, EpisodeError
@@ -58,7 +59,7 @@ def _findings(path: Path, curation: Curation, known: set[str]) -> set[str]:
     except CurationError as err:
         error = err
     if error is not None:
-        assert "\n" not in str(error)
+        assert str(error).isprintable()
         return {error.finding}
     found = {f.id for f in curation.decide(episode).findings}
     found |= {f.id for f in check_episode(episode, _BASELINE)}
@@ -229,6 +230,12 @@ def test_reading_leaves_no_file_open(bench: Bench, curation: Curation, tmp_path:
 # --- errors -------------------------------------------------------------------------------------
 
 
+def test_error_is_one_line_that_a_terminal_does_not_obey() -> None:
+    error = BagError("topic /a\n\x1b[2J\udcff: ä µ", finding="checksum")
+    assert str(error) == "topic /a\\n\\x1b[2J\\udcff: ä µ"
+    assert str(error).isprintable()
+
+
 def test_error_keeps_its_finding_on_the_way_from_a_worker(tmp_path: Path) -> None:
     errors = [
         TornFileError(tmp_path, "it ends at byte 9 without a footer", "truncated"),
@@ -245,3 +252,29 @@ def test_error_keeps_its_finding_on_the_way_from_a_worker(tmp_path: Path) -> Non
 def test_every_finding_of_an_error_is_in_the_list() -> None:
     for leaf in CurationError.__subclasses__():
         assert leaf.finding == "" or leaf.finding in FINDINGS
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000,
+        "{a: " * 50_000,
+        "- " * 100_000,
+        "? " * 100_000,
+        "\n".join(" " * k + "-" for k in range(4000)),
+        "a: &a [*a]",
+        "a: &a {b: *a}",
+        " " * (17 << 20),
+    ],
+    ids=["flow", "mapping", "block", "key", "indented", "endless", "endless-mapping", "long"],
+)
+def test_yaml_that_is_a_trap_is_refused(text: str) -> None:
+    """Some of these overflow the stack of libyaml, which ends the process."""
+    for form in (text, text.encode()):
+        with pytest.raises(ValueError, match="not metadata"):
+            load_yaml(form)
+
+
+def test_yaml_with_aliases_and_levels_is_read() -> None:
+    assert load_yaml("a: &x [1, 2]\nb: *x\n") == {"a": [1, 2], "b": [1, 2]}
+    assert load_yaml("[" * 90 + "]" * 90)
