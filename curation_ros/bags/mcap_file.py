@@ -44,7 +44,10 @@ _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQII")
 _CHUNK_INDEX = struct.Struct("<QQQQI")
-_MESSAGE_INDEX = struct.Struct("<HI")
+_CHANNEL_OFFSET = struct.Struct("<HQ")
+_LENGTH = struct.Struct("<Q")
+#: Head of a message index with its opcode and length: channel, bytes of its entries.
+_MESSAGE_INDEX = struct.Struct("<BQHI")
 #: Head of a message record with its opcode and length, and an entry of a message index.
 _MESSAGE_HEAD = np.dtype(
     [
@@ -302,7 +305,7 @@ def _chunk_data(path: Path, at: int, body: bytes) -> bytes:
     try:
         _, _, size, checksum, name_size = _CHUNK.unpack_from(body)
         compression = body[_CHUNK.size : _CHUNK.size + name_size].decode()
-        (packed_size,) = struct.unpack_from("<Q", body, _CHUNK.size + name_size)
+        (packed_size,) = _LENGTH.unpack_from(body, _CHUNK.size + name_size)
     except (struct.error, ValueError) as err:
         raise torn("is malformed") from err
     packed_at = _CHUNK.size + name_size + 8
@@ -345,8 +348,12 @@ class ChunkPlace(NamedTuple):
     start: int
     size: int
     index_size: int
-    unpacked_size: int
-    channels: frozenset[int]
+    channel_map: bytes
+
+    @property
+    def channels(self) -> frozenset[int]:
+        """Ids of the channels that have messages in it."""
+        return frozenset(channel for channel, _ in _CHANNEL_OFFSET.iter_unpack(self.channel_map))
 
 
 @dataclass
@@ -496,10 +503,11 @@ def _note_index(info: McapInfo, opcode: int, body: bytes, metadata_at: list[int]
         return
     _, _, start, size, map_size = _CHUNK_INDEX.unpack_from(body)
     rest = _CHUNK_INDEX.size + map_size
-    channels = frozenset(i for i, _ in struct.iter_unpack("<HQ", body[_CHUNK_INDEX.size : rest]))
-    index_size, compression_size = struct.unpack_from("<QI", body, rest)
-    _, unpacked_size = struct.unpack_from("<QQ", body, rest + 12 + compression_size)
-    info.chunks.append(ChunkPlace(start, size, index_size, unpacked_size, channels))
+    if map_size % _CHANNEL_OFFSET.size:
+        raise ValueError("half an entry at the end of a map")
+    (index_size,) = _LENGTH.unpack_from(body, rest)
+    channel_map = body[_CHUNK_INDEX.size : rest]
+    info.chunks.append(ChunkPlace(start, size, index_size, channel_map))
 
 
 class MessageBlock(NamedTuple):
@@ -591,7 +599,7 @@ def _message_indexes(path: Path, info: McapInfo, file: _File) -> list[dict[int, 
             max(place.size, place.index_size) > _MAX_RECORD_BYTES
             or len(head) < _RECORD.size
             or _RECORD.unpack(head) != (Opcode.CHUNK, place.size - _RECORD.size)
-            or not _holds_no_message(path, file, at, place.start)
+            or (at != place.start and not _holds_no_message(path, file, at, place.start))
         ):
             return None
         at = place.start + place.size
@@ -627,18 +635,17 @@ def _holds_no_message(path: Path, file: _File, at: int, stop: int) -> bool:
 def _index_entries(data: bytes) -> dict[int, bytes] | None:
     """Channel -> entries of its message index; None where the bytes are anything else."""
     entries: dict[int, bytes] = {}
-    at, head_size = 0, _RECORD.size + _MESSAGE_INDEX.size
-    while at < len(data):
-        if len(data) - at < head_size:
+    at, stop, head_size = 0, len(data), _MESSAGE_INDEX.size
+    while at < stop:
+        if stop - at < head_size:
             return None
-        opcode, length = _RECORD.unpack_from(data, at)
-        channel, size = _MESSAGE_INDEX.unpack_from(data, at + _RECORD.size)
+        opcode, length, channel, size = _MESSAGE_INDEX.unpack_from(data, at)
         at += head_size
         if (
             opcode != Opcode.MESSAGE_INDEX
-            or length != _MESSAGE_INDEX.size + size
+            or length != size + head_size - _RECORD.size
             or size % _ENTRY_BYTES
-            or size > len(data) - at
+            or size > stop - at
             or channel in entries
         ):
             return None
@@ -696,15 +703,18 @@ def _split_by_index(
     path: Path, chunks: Sequence[_Chunk], wanted: frozenset[int]
 ) -> MessageBlock | None:
     """The wanted messages of unpacked chunks; None where the index does not fit them."""
-    stops = np.cumsum([len(chunk.data) for chunk in chunks])
+    sizes = np.array([len(chunk.data) for chunk in chunks], dtype=np.int64)
+    stops = np.cumsum(sizes)
     # Some bytes more: whoever gathers whole words reads beyond the last message.
     buffer = np.frombuffer(b"".join([*(chunk.data for chunk in chunks), bytes(8)]), np.uint8)
-    parts = [(k, c, raw) for k, chunk in enumerate(chunks) for c, raw in chunk.entries.items()]
-    repeats = [len(raw) // _ENTRY_BYTES for _, _, raw in parts]
-    stop = np.repeat(stops[[k for k, _, _ in parts]], repeats)
-    base = np.repeat([int(stops[k]) - len(chunks[k].data) for k, _, _ in parts], repeats)
-    claimed = np.repeat([channel for _, channel, _ in parts], repeats)
-    offsets = np.frombuffer(b"".join([raw for _, _, raw in parts]), "<i8")[1::2]
+    ids = [channel for chunk in chunks for channel in chunk.entries]
+    raws = [raw for chunk in chunks for raw in chunk.entries.values()]
+    repeats = np.array([len(raw) for raw in raws], dtype=np.int64) // _ENTRY_BYTES
+    chunk_of = np.repeat(np.arange(len(chunks)), [len(chunk.entries) for chunk in chunks])
+    stop = np.repeat(stops[chunk_of], repeats)
+    base = np.repeat((stops - sizes)[chunk_of], repeats)
+    claimed = np.repeat(np.array(ids, dtype=np.uint16), repeats)
+    offsets = np.frombuffer(b"".join(raws), "<i8")[1::2]
     if ((offsets < 0) | (offsets > stop - base - _MESSAGE_HEAD.itemsize)).any():
         return None
     order = np.argsort(offsets + base)
@@ -720,12 +730,11 @@ def _split_by_index(
     for k in np.flatnonzero(ends != begins).tolist():
         if not _gap_holds_no_message(path, chunks, stops, int(ends[k]), int(begins[k])):
             return None
-    starts, sizes = at + _MESSAGE_HEAD.itemsize, lengths - _MESSAGE.size
-    if not wanted.issuperset(channel for _, channel, raw in parts if raw):
+    messages = Messages(buffer, at + _MESSAGE_HEAD.itemsize, lengths - _MESSAGE.size)
+    if not wanted.issuperset(ids):
         rows = np.isin(channels, list(wanted))
-        heads, channels, starts, sizes = heads[rows], channels[rows], starts[rows], sizes[rows]
-    messages = Messages(buffer, starts, sizes)
-    if len(buffer) > _MOST_UNWANTED * int(sizes.sum()):
+        heads, channels, messages = heads[rows], channels[rows], messages.take(rows)
+    if len(buffer) > _MOST_UNWANTED * int(messages.sizes.sum()):
         messages = messages.compact()  # else some poses would keep the images beside them
     return MessageBlock(
         channels.astype(np.int64),
