@@ -199,9 +199,24 @@ class LiveCuration:
         if known and found == "equal":
             self._amend(known[-1], {"bag": found})
             return None
+        own = in_force(d for d in known if d.by == CURATOR).get(episode_id)
+        if found == "alone" and own is not None and self._stands(own, episode):
+            return Decided(in_force(known)[episode_id])
         decision = self._judge(episode)
         evidence = {**decision.evidence, "bag": found}
         return Decided(log_decision(self.dataset, replace(decision, evidence=evidence)))
+
+    def _stands(self, own: Decision, episode: Episode) -> bool:
+        """Whether our decision on an episode that was not seen again need not be made again.
+
+        A curator that starts anew hears of the last bag once more; that is no reason to forget
+        that it was compared with what had been seen, or to make a final decision provisional.
+        """
+        if own.evidence.get("content") != episode.content_digest:
+            return False
+        if self.curation.rule_looks_at_dataset:
+            return bool(own.evidence.get("scoring") == self.curation.scoring_hash)
+        return own.state_hash == self.curation.state_hash
 
     def finish(self) -> list[Decision]:
         """Decide on the whole dataset, finally, where the rule depends on all of it.

@@ -393,7 +393,8 @@ def test_curator_that_starts_again_does_not_decide_on_what_it_has_not_seen(
     told = _told(again.tick(DRAIN_S))  # who listens to us hears the decision again
     assert (told.revision, told.verdict) == (1, "keep")
     assert dataset.latest_decisions()[_good().id] == told
-    assert dataset.decision_log(_good().id).read_bytes().startswith(before)
+    assert told.evidence["bag"] == "equal"
+    assert dataset.decision_log(_good().id).read_bytes() == before
 
 
 def test_curator_that_comes_in_mid_episode_says_what_is_missing(dataset: Dataset) -> None:
@@ -660,6 +661,20 @@ def test_final_decisions_are_over_the_whole_dataset_whatever_came_first(dataset:
     assert live.finish() == []  # nothing new
     manifest, _ = save_selection(dataset, rule="decisions")
     assert {e.episode for e in manifest.entries} == {e.id for e in episodes[3:]}
+
+
+def test_curator_that_starts_again_leaves_a_final_decision_as_it_is(dataset: Dataset) -> None:
+    live = _curator(dataset, _share())
+    episodes = _episodes(6)
+    for episode in episodes:
+        _watch(live, episode, samples_of(episode))
+        record(dataset, episode)
+        live.bag_closed(episode.id)
+    live.finish()
+    final = dataset.latest_decisions()
+    [told] = _curator(dataset, _share()).bag_closed(episodes[0].id)
+    assert told.decision == final[episodes[0].id]
+    assert dataset.latest_decisions() == final
 
 
 def test_finishing_waits_for_the_running_episode(dataset: Dataset) -> None:
