@@ -172,9 +172,12 @@ class LabelFreeNearestNeighbours(PoolScorer):
     def _judge(self, features: Floats, model: int) -> float:
         """0 amid the others, more negative further away; in standard deviations."""
         # The mean cancels: only the scale is left in the difference of two standardised rows.
-        others = self.table_[self.fold_ != model]  # the last model is no fold: all
-        distance = np.linalg.norm((others - features) / self.scale_[model], axis=1)
-        return -float(np.sort(distance)[: self.k].mean())
+        apart = self.table_ - features
+        apart /= self.scale_[model]
+        squared = np.einsum("ij,ij->i", apart, apart)
+        squared[self.fold_ == model] = np.inf  # the last model is no fold: all are others
+        k = min(self.k, int(self.n_others_[model]))
+        return -float(np.sqrt(np.sort(np.partition(squared, k - 1)[:k])).mean())
 
 
 def _check_ranges(scorer: NearestNeighbours | LabelFreeNearestNeighbours) -> None:
