@@ -18,13 +18,12 @@ import numpy as np
 
 from curation_ros.bags.cdr import CdrDecoder, shared_decoder
 from curation_ros.bags.definitions import full_type_name, parse_definition
+from curation_ros.bags.mcap_blocks import MessageBlock, read_blocks
 from curation_ros.bags.mcap_file import (
     McapInfo,
     Message,
-    MessageBlock,
     TornFileError,
     open_now,
-    read_blocks,
     read_info,
     walk,
 )

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, IndexType, Writer
 
+from curation_ros.bags.mcap_blocks import read_blocks
 from curation_ros.bags.mcap_file import (
     MAGIC,
     McapInfo,
     Message,
     TornFileError,
-    read_blocks,
     read_info,
     walk,
 )
@@ -124,8 +124,8 @@ def test_blocks_are_read_from_files_without_chunks_statistics_or_checksums(
 
 
 def test_blocks_end_after_many_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("curation_ros.bags.mcap_file._BLOCK_BYTES", 500)
-    monkeypatch.setattr("curation_ros.bags.mcap_file._SMALL_BYTES", 100)
+    monkeypatch.setattr("curation_ros.bags.mcap_blocks._BLOCK_BYTES", 500)
+    monkeypatch.setattr("curation_ros.bags.mcap_blocks._SMALL_BYTES", 100)
     path = tmp_path / "a.mcap"
     for index_types in (IndexType.ALL, IndexType.NONE):
         shape = _Shape([0, 1] * 30, [20] * 60, 200, CompressionType.LZ4, index_types)
