@@ -1,5 +1,7 @@
 # make demo    the whole path in front of you: record, score, decide, train, drive (6 minutes)
 # make test    checks and tests, as CI runs them
+# make docs    docs/metrics.md anew, from the code
+# make bench   the benchmarks (half an hour)
 # Each makes .venv by itself. A CPU-only torch: make TORCH_BACKEND=cpu demo
 
 PYTHON ?= python3
@@ -15,7 +17,7 @@ endif
 # Of the extras, so that asking for others installs them.
 READY := $(VENV)/.ready-$(EXTRAS)
 
-.PHONY: setup demo test check bench clean
+.PHONY: setup demo test check bench docs clean
 
 setup: $(READY)
 
@@ -41,9 +43,13 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python docs/make_metrics.py --check
 
 test: check
 	$(BIN)/python -m pytest
+
+docs: setup
+	$(BIN)/python docs/make_metrics.py
 
 bench: setup
 	$(BIN)/python benchmarks/run.py
