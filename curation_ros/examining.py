@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
+from curation_ros import __version__
 from curation_ros.bags.reader import read_episode
 from curation_ros.core.decisions import Decision, untrustworthy
 from curation_ros.core.episode import Episode
@@ -144,7 +145,7 @@ class Examiner:
             by_index.setdefault(_home(one.path)[0], []).append(one)
         for folder, found in by_index.items():
             try:
-                self._task.index(folder).keep(self._task.key, found, stamps)
+                self._task.index(folder).keep(self._task, found, stamps)
             except CurationError as err:
                 self.problem = str(err)
 
@@ -215,16 +216,17 @@ class _Kept:
                     found[bag] = Examination.from_json(json.loads(text))
         return found
 
-    def keep(self, key: str, found: Sequence[Examined], stamps: Mapping[Path, str]) -> None:
+    def keep(self, task: _Task, found: Sequence[Examined], stamps: Mapping[Path, str]) -> None:
         rows, scores = [], []
+        by = task.curation.scoring_hash
         for one in found:
             if not isinstance(one.result, Examination):
                 continue
             seen = one.result
             text = json.dumps(seen.to_json(), allow_nan=False)
-            rows.append((_home(one.path)[1], key, stamps[one.path], text))
+            rows.append((_home(one.path)[1], task.key, stamps[one.path], text))
             scores += [
-                (seen.episode, scorer, key, value, seen.abstained.get(scorer))
+                (seen.episode, scorer, by, value, seen.abstained.get(scorer))
                 for scorer, value in seen.scores.items()
             ]
         with self._index.transaction() as db:
@@ -233,10 +235,9 @@ class _Kept:
 
 
 def _key(curation: Curation, topic_map: TopicMap | None) -> str:
-    """Under which an examination is kept; decisions log the hash of the scorers alone."""
-    if topic_map is None:
-        return curation.scoring_hash
-    return f"{curation.scoring_hash}+{topic_map.hash}"
+    """Under which an examination is kept: another version of ours may see other things."""
+    by = "" if topic_map is None else f"+{topic_map.hash}"
+    return f"{__version__}+{curation.scoring_hash}{by}"
 
 
 def _home(bag: Path) -> tuple[Path, str]:
