@@ -8,21 +8,17 @@ hash of both. What rules and decisions make of it costs next to nothing.
 from __future__ import annotations
 
 import json
-import logging
 import os
-import signal
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 
 from curation_ros import __version__
 from curation_ros.bags.reader import read_episode
 from curation_ros.core.decisions import Decision, untrustworthy
 from curation_ros.core.episode import Episode
-from curation_ros.core.errors import ConfigError, CurationError
+from curation_ros.core.errors import CurationError
 from curation_ros.core.examination import Examination
 from curation_ros.core.findings import Finding
 from curation_ros.core.judgement import Ruling
@@ -30,13 +26,10 @@ from curation_ros.core.scoring import Curation
 from curation_ros.core.selection import TieKey
 from curation_ros.core.topic_map import TopicMap
 from curation_ros.index import Index
+from curation_ros.workers import WorkerDiedError, check_workers, spread
 
-#: Ways to spread work: processes on this machine, or a cluster of Ray or Dask.
-BACKENDS = ("loky", "ray", "dask")
 # Bags that a worker gets at once: a fitted curation of some 100 kB goes with them.
 _BATCH = 16
-# Batches that a Ray worker is given at a time.
-_AHEAD = 4
 
 
 @dataclass(frozen=True)
@@ -82,10 +75,7 @@ class Examiner:
         Raises:
             ConfigError: for a backend that does not exist, or is not installed.
         """
-        if backend not in BACKENDS:
-            raise ConfigError(f"backend {backend!r} is none of {', '.join(BACKENDS)}")
-        if jobs == 0 or jobs < -1:
-            raise ConfigError(f"jobs {jobs}: expected a number of workers, or -1 for all cores")
+        check_workers(jobs, backend)
         self._task = _Task(curation, topic_map, _key(curation, topic_map))
         self._jobs = jobs
         self._backend = backend
@@ -113,30 +103,12 @@ class Examiner:
     def _spread(
         self, jobs: Iterable[tuple[Sequence[Path], bool]]
     ) -> Iterator[tuple[list[Examined], dict[Path, str]]]:
-        if self._jobs == 1:
-            yield from (self._task(*job) for job in jobs)
-            return
-        from joblib import Parallel, delayed
-        from joblib.externals.loky.process_executor import TerminatedWorkerError
-
-        # Who interrupts us does not ask what became of the batches ahead.
-        warnings.filterwarnings("ignore", "[0-9]+ tasks ", UserWarning)
-        with _workers(self._backend, self._jobs):
-            try:
-                if self._backend == "ray":
-                    # Its joblib backend gives no results before all are there, so it gets a few.
-                    parallel = Parallel(n_jobs=self._jobs)
-                    ahead = iter(jobs)
-                    while window := list(islice(ahead, _AHEAD * max(self._jobs, _AHEAD))):
-                        yield from parallel(delayed(self._task)(*job) for job in window)
-                else:
-                    parallel = Parallel(n_jobs=self._jobs, return_as="generator")
-                    yield from parallel(delayed(self._task)(*job) for job in jobs)
-            except TerminatedWorkerError as err:
-                raise CurationError(
-                    "a worker died (killed, or out of memory): what was examined is kept, run "
-                    "the same command again to go on"
-                ) from err
+        try:
+            yield from spread(self._task, jobs, jobs=self._jobs, backend=self._backend)
+        except WorkerDiedError as err:
+            raise CurationError(
+                f"{err}: what was examined is kept, run the same command again to go on"
+            ) from err
 
     def _keep(self, batch: Sequence[Examined], stamps: Mapping[Path, str]) -> None:
         fresh = [e for e in batch if not e.is_known and isinstance(e.result, Examination)]
@@ -260,69 +232,6 @@ def _stamp(bag: Path) -> str:
     except OSError:
         return ""
     return ";".join(f"{name}:{s.st_size}:{s.st_mtime_ns}" for name, s in found)
-
-
-@contextmanager
-def _workers(backend: str, jobs: int) -> Iterator[None]:
-    """Make joblib use a kind of workers.
-
-    A Ray cluster is that of RAY_ADDRESS, a Dask cluster that of DASK_SCHEDULER_ADDRESS; where
-    these are not set, one is started on this machine and stopped at the end.
-
-    Raises:
-        ConfigError: if the backend is not installed.
-    """
-    from joblib import parallel_config
-
-    try:
-        make = {"loky": _loky, "ray": _ray, "dask": _dask}[backend]
-        with make(jobs), parallel_config(backend=backend, n_jobs=jobs):
-            yield
-    except ModuleNotFoundError as err:
-        raise ConfigError(
-            f"backend {backend!r} needs {err.name}: pip install 'curation_ros[{backend}]'"
-        ) from err
-
-
-@contextmanager
-def _loky(jobs: int) -> Iterator[None]:
-    from joblib import Parallel, delayed, effective_n_jobs
-
-    # Ctrl-C goes to all processes of a terminal; we end the workers, and none of them is to print
-    # a traceback. What is blocked when they start stays so in them; here it waits for a moment.
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        Parallel(n_jobs=jobs, backend="loky")(
-            delayed(int)() for _ in range(effective_n_jobs(jobs))
-        )
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    yield
-
-
-@contextmanager
-def _ray(jobs: int) -> Iterator[None]:
-    import ray
-    from ray.util.joblib import register_ray
-
-    logging.getLogger("ray").setLevel(logging.ERROR)
-    cores = None if jobs < 0 or "RAY_ADDRESS" in os.environ else jobs
-    ray.init(num_cpus=cores, include_dashboard=False, log_to_driver=False)
-    try:
-        register_ray()  # type: ignore[no-untyped-call]
-        yield
-    finally:
-        ray.shutdown()
-
-
-@contextmanager
-def _dask(jobs: int) -> Iterator[None]:
-    from dask.distributed import Client
-
-    address = os.environ.get("DASK_SCHEDULER_ADDRESS")
-    workers = {} if address else {"n_workers": None if jobs < 0 else jobs, "threads_per_worker": 1}
-    with Client(address, dashboard_address=None, **workers):  # type: ignore[no-untyped-call, unused-ignore]
-        yield
 
 
 class EpisodesOf:

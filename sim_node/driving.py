@@ -1,4 +1,4 @@
-"""Runs one episode on the graph: observe, get a command, step, until it has ended."""
+"""Runs one episode: observe, get a command, step, until it has ended; the same without a graph."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from curation_ros.core.stream import NS_PER_S
 from sim_node.defects import DefectiveController
 from sim_node.env import LiberoEnv, Observation
 from sim_node.episodes import EpisodePlan
+from sim_node.output import COMMAND_TOPICS, GRIPPER_JOINT, SimOutput
 from sim_node.phases import PhaseTracker
-from sim_node.publishing import COMMAND_TOPICS, GRIPPER_JOINT, SimPublishers
 from sim_node.starts import Start
 
 Command = tuple[list[float], float]
@@ -147,19 +147,21 @@ class Driver:
     def __init__(
         self,
         env: LiberoEnv,
-        out: SimPublishers,
+        out: SimOutput,
         commands: Commands,
         settings: Mapping[str, Any],
-        announced: Callable[[str], Iterator[bool]],
+        announced: Callable[[str], Iterator[bool]] = lambda _id: iter(()),
+        stamp_ns: int | None = None,
     ) -> None:
         """Make a driver.
 
         Args:
             env: the simulator.
-            out: the node's publishers.
+            out: the node's publishers, or what takes their place.
             commands: filled by the node's subscriptions.
             settings: the node's parameters.
             announced: yields until who is waited for has taken notice of a started episode.
+            stamp_ns: before the first stamp; default: the wall's time.
         """
         self._env = env
         self._out = out
@@ -169,10 +171,19 @@ class Driver:
         self._checked_s = 0.0
         self.reset_wanted = False
         # Stamps begin at the wall's time and never go back, not at a reset either.
-        self._stamp_ns = time.time_ns()
+        self._stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
 
-    def run(self, plan: EpisodePlan, start: Start, name: str) -> Generator[bool, None, Run]:
-        """One episode; if the generator is closed early, the episode is aborted and said so."""
+    def run(
+        self, plan: EpisodePlan, start: Start, name: str, episode_id: str = ""
+    ) -> Generator[bool, None, Run]:
+        """One episode; if the generator is closed early, the episode is aborted and said so.
+
+        Args:
+            plan: what it is.
+            start: the one that the plan names.
+            name: short name of the episode.
+            episode_id: minted before; empty: minted now.
+        """
         period_ns = self._env.control_period_ns
         observation = self._env.reset(start.state)
         tracker = PhaseTracker.from_observation(observation)
@@ -183,7 +194,7 @@ class Driver:
         self.reset_wanted = False
         self._commands.clear()
         self._stamp_ns += period_ns
-        run = Run(new_episode_id(), name, plan, self._stamp_ns, controller)
+        run = Run(episode_id or new_episode_id(), name, plan, self._stamp_ns, controller)
         try:
             self._out.event(EpisodeEvent(run.id, name, "started", run.start_ns))
             yield from self._announced(run.id)

@@ -8,6 +8,7 @@ substep, so that positions, velocities and poses belong to one instant.
 
 from __future__ import annotations
 
+import functools
 import logging
 import time
 from dataclasses import dataclass
@@ -160,6 +161,11 @@ class LiberoEnv:
         self.close()
 
     @property
+    def n_steps(self) -> int:
+        """Commands executed since the last reset; below 0 while it settles."""
+        return self._n_steps
+
+    @property
     def model(self) -> mujoco.MjModel:
         """The MuJoCo model; without visual geoms if lean. Read only."""
         return self._model
@@ -275,6 +281,12 @@ class LiberoEnv:
         if not (np.isfinite(self._data.qpos).all() and np.isfinite(self._data.qvel).all()):
             return "state is not finite"
         return None
+
+
+@functools.cache
+def process_env() -> LiberoEnv:
+    """The lean environment of this process, made once: for workers that get task after task."""
+    return LiberoEnv()
 
 
 class _LeanStepper:

@@ -24,7 +24,8 @@ from sim_node.defects import DEFECTS
 from sim_node.driving import Commands, Driver, Run
 from sim_node.env import LiberoEnv
 from sim_node.episodes import EpisodePlan, plan_episodes
-from sim_node.publishing import COMMAND_TOPICS, SimPublishers
+from sim_node.output import COMMAND_TOPICS
+from sim_node.publishing import SimPublishers
 from sim_node.starts import parse_starts
 
 PARAMETERS = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TwistStamped
@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
-from curation_ros.core.status import EpisodeEvent, Status, event_to_status, phase_to_status
+from curation_ros.core.status import EpisodeEvent, Status, event_to_status
 from curation_ros.nodes.delivery import deliver
 from curation_ros.nodes.matching import Matching
 from curation_ros.nodes.messages import (
@@ -22,13 +22,11 @@ from curation_ros.nodes.messages import (
 )
 from curation_ros.nodes.qos import EVENTS, LATCHED, MAPPED
 from sim_node.env import LiberoEnv, Observation
+from sim_node.output import COMMAND_TOPICS, SimOutput
 from sim_node.phases import PhaseTracker
 
-COMMAND_TOPICS = ("command/twist", "command/gripper")
-GRIPPER_JOINT = "gripper"
 
-
-class SimPublishers:
+class SimPublishers(SimOutput):
     """All publishers of the sim node; `episode` and the commands exist only for their owner."""
 
     def __init__(self, node: Node, env: LiberoEnv, *, owner: bool, expert: bool) -> None:
@@ -40,55 +38,50 @@ class SimPublishers:
             owner: whether this node owns the episodes.
             expert: whether this node gives the commands.
         """
+        super().__init__(env)
         self._node = node
-        self._env = env
         make = node.create_publisher
         self._episode = make(DiagnosticArray, "episode", LATCHED) if owner else None
         self._outcome = make(DiagnosticArray, "episode/outcome", LATCHED) if owner else None
         self._clock = make(Clock, "/clock", EVENTS)
-        self._joints = make(JointState, "joint_states", MAPPED)
-        self._eef = make(PoseStamped, "eef_pose", MAPPED)
-        self._phase = make(DiagnosticArray, "phase", MAPPED)
-        self._objects = {
-            name: make(PoseStamped, f"objects/{name}/pose", MAPPED) for name in env.object_names
+        kinds = {"joint_states": JointState, "eef_pose": PoseStamped, "phase": DiagnosticArray}
+        self._mapped = {
+            topic: make(kinds.get(topic, PoseStamped), topic, MAPPED)
+            for topic in self.observation_topics
         }
-        self._twist = make(TwistStamped, COMMAND_TOPICS[0], MAPPED) if expert else None
-        self._gripper = make(JointState, COMMAND_TOPICS[1], MAPPED) if expert else None
-        self.observation_topics = (
-            "joint_states",
-            "eef_pose",
-            "phase",
-            *(f"objects/{name}/pose" for name in env.object_names),
-        )
+        if expert:
+            for topic, kind in zip(COMMAND_TOPICS, (TwistStamped, JointState), strict=True):
+                self._mapped[topic] = make(kind, topic, MAPPED)
         self._matching = Matching(node)
 
     def observation(
         self, stamp_ns: int, o: Observation, tracker: PhaseTracker, episode_id: str
     ) -> None:
-        """Publish everything that is seen at one stamp."""
+        """Publish everything that is seen at one stamp, the clock first."""
         self._clock.publish(Clock(clock=time_to_ros(stamp_ns)))
-        self._joints.publish(
-            joints_to_ros(
-                self._env.joint_names,
-                [*o.joint_position_rad, *o.finger_position_m],
-                [*o.joint_velocity_rad_s, *o.finger_velocity_m_s],
-                [*o.joint_effort_nm, *o.finger_effort_n],
-                stamp_ns,
-            )
-        )
-        for name, publisher in self._objects.items():
-            publisher.publish(pose_to_ros(*o.objects[name], stamp_ns))
-        phase = phase_to_status(episode_id, tracker.name, tracker.index, tracker.progress)
-        self._phase.publish(array_to_ros([phase], stamp_ns))
-        # The clock-role topic goes last: who has it has, of a fast writer, mostly the rest too.
-        self._eef.publish(pose_to_ros(o.eef_position_m, o.eef_quat_xyzw, stamp_ns))
+        super().observation(stamp_ns, o, tracker, episode_id)
 
-    def command(self, stamp_ns: int, xyz: Iterable[float], gripper: float) -> None:
-        """Publish the expert's command."""
-        assert self._twist is not None
-        assert self._gripper is not None
-        self._twist.publish(twist_to_ros(xyz, stamp_ns))
-        self._gripper.publish(joints_to_ros([GRIPPER_JOINT], [gripper], [0.0], [0.0], stamp_ns))
+    def _joints(
+        self,
+        topic: str,
+        names: Sequence[str],
+        position: Iterable[float],
+        velocity: Iterable[float],
+        effort: Iterable[float],
+        stamp_ns: int,
+    ) -> None:
+        self._mapped[topic].publish(joints_to_ros(names, position, velocity, effort, stamp_ns))
+
+    def _pose(
+        self, topic: str, position_m: Iterable[float], quat_xyzw: Iterable[float], stamp_ns: int
+    ) -> None:
+        self._mapped[topic].publish(pose_to_ros(position_m, quat_xyzw, stamp_ns))
+
+    def _twist(self, topic: str, xyz: Iterable[float], stamp_ns: int) -> None:
+        self._mapped[topic].publish(twist_to_ros(xyz, stamp_ns))
+
+    def _status(self, topic: str, status: Status, stamp_ns: int) -> None:
+        self._mapped[topic].publish(array_to_ros([status], stamp_ns))
 
     def event(self, event: EpisodeEvent) -> None:
         """Publish an event of an episode.
@@ -117,7 +110,7 @@ class SimPublishers:
     def flush(self) -> None:
         """Wait until every subscriber has everything of our episodes."""
         if self._episode is not None:
-            observations = (self._joints, *self._objects.values(), self._phase, self._eef)
+            observations = [self._mapped[topic] for topic in self.observation_topics]
             deliver([self._episode, self._outcome, *observations])
 
     def is_matched(self, node_name: str) -> bool:

@@ -100,7 +100,8 @@ def _share_folder(type_name: str) -> Path | None:
 
 
 @functools.cache
-def _typestore() -> Any:  # rosbags gives no public name to the class
+def jazzy_typestore() -> Any:  # rosbags gives no public name to the class
+    """The messages of Jazzy, as rosbags knows them without ROS."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -108,7 +109,7 @@ def _typestore() -> Any:  # rosbags gives no public name to the class
 
 def _rosbags_schema(type_name: str) -> MessageSchema:
     try:
-        store = _typestore()
+        store = jazzy_typestore()
     except ImportError as err:
         raise BagError(
             f"no definition of {type_name}: its ROS package is not installed, nor is rosbags",

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from curation_ros.workers import BACKENDS
+
 
 def add_reference(parser: argparse.ArgumentParser) -> None:
     """`--reference`: trusted demonstrations."""
@@ -26,4 +28,17 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--topic-map", type=Path, help="default: the one that is stored in the bag"
+    )
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """`--jobs` and `--backend`: over how many workers, of which kind, work is spread."""
+    parser.add_argument(
+        "--jobs", type=int, default=1, metavar="N", help="workers; -1 takes all cores"
+    )
+    parser.add_argument(
+        "--backend",
+        choices=BACKENDS,
+        default="loky",
+        help="of the workers: processes here, or a cluster (RAY_ADDRESS, DASK_SCHEDULER_ADDRESS)",
     )

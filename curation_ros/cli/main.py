@@ -22,6 +22,7 @@ COMMANDS = {
     "index": ("curation_ros.cli.index", "list a dataset; rebuild its index from its files"),
     "self-check": ("curation_ros.cli.self_check", "prove that no score depends on labels"),
     "record": ("curation_ros.cli.record", "start and stop a recorder that is driven by hand"),
+    "collect": ("curation_ros.cli.collect", "record simulated demonstrations, without ROS"),
     "train": ("curation_ros.cli.train", "train a policy on a selection"),
     "evaluate": ("curation_ros.cli.evaluate", "count a policy's successes over start states"),
     "demo": ("curation_ros.cli.demo", "the whole path, from recording to the trained policy"),

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from curation_ros.bags.reader import find_bags
-from curation_ros.cli.arguments import add_config, add_reference
+from curation_ros.cli.arguments import add_config, add_reference, add_workers
 from curation_ros.cli.output import VERDICT_STYLE, console, print_json, progress_console, warn
 from curation_ros.configuration import read_curation, read_reference, share_file
 from curation_ros.core.decisions import Decision
@@ -26,7 +26,7 @@ from curation_ros.core.selection import TieKey
 from curation_ros.core.topic_map import read_topic_map
 from curation_ros.curating import log_decision
 from curation_ros.dataset import Dataset
-from curation_ros.examining import BACKENDS, EpisodesOf, Examined, Examiner, judge_bags
+from curation_ros.examining import EpisodesOf, Examined, Examiner, judge_bags
 
 _DONE, _FINDINGS, _NOTHING = 0, 1, 3
 _FIXED_WIDTH, _SCORE_WIDTH = 64, 12
@@ -55,15 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--check", action="store_true", help="exit with 1 where there are findings"
     )
-    parser.add_argument(
-        "--jobs", type=int, default=1, metavar="N", help="workers; -1 takes all cores"
-    )
-    parser.add_argument(
-        "--backend",
-        choices=BACKENDS,
-        default="loky",
-        help="of the workers: processes here, or a cluster (RAY_ADDRESS, DASK_SCHEDULER_ADDRESS)",
-    )
+    add_workers(parser)
     parser.add_argument(
         "--fresh", action="store_true", help="score again what has been scored already"
     )

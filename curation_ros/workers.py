@@ -1,0 +1,166 @@
+"""Spreads work over workers by joblib: processes on this machine, or a cluster of Ray or Dask."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from typing import Any, TypeVar
+
+from curation_ros.core.errors import ConfigError, CurationError
+
+#: Ways to spread work: processes on this machine, or a cluster of Ray or Dask.
+BACKENDS = ("loky", "ray", "dask")
+#: Tasks that are handed out ahead of the results, for each worker.
+AHEAD = 2
+# Tasks that a Ray worker is given at a time.
+_RAY_AHEAD = 4
+
+Result = TypeVar("Result")
+
+
+class WorkerDiedError(CurationError):
+    """A worker was killed or ran out of memory; results that have come are whole."""
+
+
+def check_workers(jobs: int, backend: str) -> None:
+    """Refuse a number or a kind of workers that does not exist.
+
+    Raises:
+        ConfigError: naming what was found and what is expected.
+    """
+    if backend not in BACKENDS:
+        raise ConfigError(f"backend {backend!r} is none of {', '.join(BACKENDS)}")
+    if jobs == 0 or jobs < -1:
+        raise ConfigError(f"jobs {jobs}: expected a number of workers, or -1 for all cores")
+
+
+def spread(
+    function: Callable[..., Result],
+    tasks: Iterable[tuple[Any, ...]],
+    *,
+    jobs: int = 1,
+    backend: str = "loky",
+    in_order: bool = True,
+    ray_ahead: int = _RAY_AHEAD,
+) -> Iterator[Result]:
+    """Call a function for every task, and yield the results.
+
+    Memory does not grow with the number of tasks: workers are given a few ahead.
+
+    Args:
+        function: goes to the workers with each task; its module must be importable there.
+        tasks: its arguments; taken one after another, in this process.
+        jobs: workers; 1 works in this process, -1 takes all cores.
+        backend: one of BACKENDS, where there are several workers.
+        in_order: results in the order of the tasks; False: as they come (Ray keeps the order).
+        ray_ahead: tasks that Ray is given at a time, for each worker (at least for four): its
+            joblib backend gives no result before all of them are there.
+
+    Raises:
+        ConfigError: if the backend does not exist or is not installed.
+        WorkerDiedError: if a worker died.
+    """
+    check_workers(jobs, backend)
+    if jobs == 1:
+        yield from (function(*task) for task in tasks)
+        return
+    from joblib import Parallel, delayed
+
+    # Who interrupts us does not ask what became of the tasks ahead.
+    warnings.filterwarnings("ignore", "[0-9]+ tasks ", UserWarning)
+    with workers(backend, jobs), _deaths():
+        if backend == "ray":
+            parallel = Parallel(n_jobs=jobs)
+            ahead = iter(tasks)
+            while window := list(islice(ahead, ray_ahead * max(jobs, _RAY_AHEAD))):
+                yield from parallel(delayed(function)(*task) for task in window)
+        else:
+            kind = "generator" if in_order else "generator_unordered"
+            parallel = Parallel(n_jobs=jobs, return_as=kind, pre_dispatch=f"{AHEAD} * n_jobs")
+            yield from parallel(delayed(function)(*task) for task in tasks)
+
+
+@contextmanager
+def _deaths() -> Iterator[None]:
+    """Make one error of what the backends raise when a worker has died."""
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    deaths: list[type[BaseException]] = [TerminatedWorkerError]
+    if ray := sys.modules.get("ray"):
+        deaths.append(ray.exceptions.WorkerCrashedError)
+        deaths.append(ray.exceptions.RayActorError)
+    if distributed := sys.modules.get("distributed"):
+        deaths.append(distributed.KilledWorker)
+    try:
+        yield
+    except tuple(deaths) as err:
+        raise WorkerDiedError("a worker died (killed, or out of memory)") from err
+
+
+@contextmanager
+def workers(backend: str, jobs: int) -> Iterator[None]:
+    """Make joblib use a kind of workers.
+
+    A Ray cluster is that of RAY_ADDRESS, a Dask cluster that of DASK_SCHEDULER_ADDRESS; where
+    these are not set, one is started on this machine and stopped at the end.
+
+    Raises:
+        ConfigError: if the backend is not installed.
+    """
+    from joblib import parallel_config
+
+    try:
+        make = {"loky": _loky, "ray": _ray, "dask": _dask}[backend]
+        with make(jobs), parallel_config(backend=backend, n_jobs=jobs):
+            yield
+    except ModuleNotFoundError as err:
+        raise ConfigError(
+            f"backend {backend!r} needs {err.name}: pip install 'curation_ros[{backend}]'"
+        ) from err
+
+
+@contextmanager
+def _loky(jobs: int) -> Iterator[None]:
+    from joblib import Parallel, delayed, effective_n_jobs
+
+    # Ctrl-C goes to all processes of a terminal; we end the workers, and none of them is to print
+    # a traceback. What is blocked when they start stays so in them; here it waits for a moment.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        Parallel(n_jobs=jobs, backend="loky")(
+            delayed(int)() for _ in range(effective_n_jobs(jobs))
+        )
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    yield
+
+
+@contextmanager
+def _ray(jobs: int) -> Iterator[None]:
+    import ray
+    from ray.util.joblib import register_ray
+
+    logging.getLogger("ray").setLevel(logging.ERROR)
+    cores = None if jobs < 0 or "RAY_ADDRESS" in os.environ else jobs
+    ray.init(num_cpus=cores, include_dashboard=False, log_to_driver=False)
+    try:
+        register_ray()  # type: ignore[no-untyped-call]
+        yield
+    finally:
+        ray.shutdown()
+
+
+@contextmanager
+def _dask(jobs: int) -> Iterator[None]:
+    from dask.distributed import Client
+
+    address = os.environ.get("DASK_SCHEDULER_ADDRESS")
+    started = {} if address else {"n_workers": None if jobs < 0 else jobs, "threads_per_worker": 1}
+    with Client(address, dashboard_address=None, **started):  # type: ignore[no-untyped-call, unused-ignore]
+        yield
