@@ -101,7 +101,9 @@ def test_truncated_bag_is_named_and_the_others_are_played(graph, dataset):
     torn = copy / ids[1] / f"{ids[1]}_0.mcap"
     torn.write_bytes(torn.read_bytes()[:-2000])
     graph.decisions.clear()
-    graph.start("replay", bags=[copy])
+    # So slowly that we, too, have discovered it before it is over.
+    graph.start("replay", bags=[copy], rate=0.5)
+    graph.until(lambda: any(e.source == "replay" for e in graph.events), "we hear the replay")
     code, log = graph.expect_exit("replay")
     assert code == 0
     assert [line for line in log.splitlines() if "[ERROR]" in line and str(torn) in line]
