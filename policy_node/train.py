@@ -6,7 +6,7 @@ import itertools
 import math
 import platform
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -39,6 +39,7 @@ class TrainedPolicy:
         network: the same in torch, on standardised observations.
         loss: mean loss of the last batches of the curve.
         curve: (step, mean loss of the batches since the entry before).
+        losses: of every batch, one a step.
         seconds: that the training took.
     """
 
@@ -46,7 +47,97 @@ class TrainedPolicy:
     network: torch.nn.Sequential
     loss: float
     curve: tuple[tuple[int, float], ...]
+    losses: tuple[float, ...]
     seconds: float
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to train, whatever the demonstrations and the seed; `train` says what each means.
+
+    Raises:
+        PolicyError: if one is out of range.
+    """
+
+    steps: int
+    batch_size: int
+    lr: float
+    weight_decay: float
+    hidden: tuple[int, ...]
+    std_floor: float
+    start_jitter_m: float
+    action_scale: float
+
+    def __post_init__(self) -> None:
+        for name, value in (
+            ("steps", self.steps),
+            ("batch_size", self.batch_size),
+            ("hidden", min(self.hidden, default=0)),
+        ):
+            if value < 1:
+                raise PolicyError(f"training: {name} is {value}, expected at least 1")
+        for name, number in (("lr", self.lr), ("std_floor", self.std_floor)):
+            if not number > 0.0:
+                raise PolicyError(f"training: {name} is {number}, expected more than 0")
+        at_least_zero = {"weight_decay": self.weight_decay, "start_jitter_m": self.start_jitter_m}
+        for name, number in at_least_zero.items():
+            if not number >= 0:
+                raise PolicyError(f"training: {name} is {number}, expected 0 or more")
+        ActionSpec(self.action_scale)
+
+
+class TrainingSet:
+    """What a network learns from: the rows of all spans, standardised.
+
+    Args:
+        episodes: as `train` takes them.
+        variant: of the observations.
+        settings: of the training.
+
+    Attributes:
+        episodes: with their spans, by id and span.
+        n_steps: rows of each.
+        spec: of the observations, D columns.
+        mean, std: (D,) that the observations were standardised by.
+        obs: (N, D) float32, standardised.
+        targets: (N, 4) float32.
+        jitter: (S, D) float32, what noise of S values with standard deviation 1 adds to obs.
+        clipped_fraction: of the values of the twist.
+
+    Raises:
+        PolicyError: if there is no episode, one is given twice or cannot be used, or their topic
+            maps differ.
+    """
+
+    def __init__(
+        self, episodes: Iterable[tuple[Episode, Span | None]], variant: str, settings: Settings
+    ) -> None:
+        self.episodes = _sorted(episodes)
+        # Without phases the check says what is missing, and where.
+        self.spec = ObservationSpec(variant, self.episodes[0][0].phase_labels or PHASES)
+        action = ActionSpec(settings.action_scale)
+        parts = [self.spec.from_episode(episode, span) for episode, span in self.episodes]
+        self.n_steps = [len(part) for part in parts]
+        obs = np.concatenate(parts)
+        targets = np.concatenate([action.targets(*pair) for pair in self.episodes])
+        n_clipped = sum(
+            action.clipped_fraction(*pair) * n
+            for pair, n in zip(self.episodes, self.n_steps, strict=True)
+        )
+        self.clipped_fraction = n_clipped / len(obs)
+        self.mean, self.std = normalisation(obs, self.spec, settings.std_floor)
+        self.obs = torch.from_numpy(standardise(obs, self.mean, self.std))
+        self.targets = torch.from_numpy(targets.astype(np.float32))
+        # Of standardised columns, by noise of standard deviation 1.
+        jitter = settings.start_jitter_m * self.spec.start_effect / self.std
+        self.jitter = torch.from_numpy(jitter.astype(np.float32))
+
+    def __len__(self) -> int:
+        return len(self.obs)
+
+    def widths(self, hidden: tuple[int, ...]) -> tuple[int, ...]:
+        """Of the layers of a network, from the observation to the output."""
+        return (self.spec.width, *hidden, N_OUTPUTS)
 
 
 def train(
@@ -97,59 +188,71 @@ def train(
             cannot be used, their topic maps differ, or the loss is not finite (naming the step).
     """
     started_s = time.perf_counter()
-    _check_settings(seed, steps, batch_size, lr, weight_decay, hidden, std_floor, start_jitter_m)
-    chosen = _sorted(episodes)
-    # Without phases the check says what is missing, and where.
-    spec = ObservationSpec(variant, chosen[0][0].phase_labels or PHASES)
-    action = ActionSpec(action_scale)
-    parts = [spec.from_episode(episode, span) for episode, span in chosen]
-    obs = np.concatenate(parts)
-    targets = np.concatenate([action.targets(episode, span) for episode, span in chosen])
-    n_clipped = sum(
-        action.clipped_fraction(episode, span) * len(part)
-        for (episode, span), part in zip(chosen, parts, strict=True)
+    check_seed(seed)
+    settings = Settings(
+        steps, batch_size, lr, weight_decay, hidden, std_floor, start_jitter_m, action_scale
     )
-    mean, std = normalisation(obs, spec, std_floor)
+    data = TrainingSet(episodes, variant, settings)
+    with one_thread():
+        network = new_network(data.widths(hidden), seed)
+        losses = _fit(network, data, settings, seed, progress)
+    return trained_policy(
+        network, losses, data, settings, seed, selection, time.perf_counter() - started_s
+    )
 
-    with _one_thread():
-        network = _network((spec.width, *hidden, N_OUTPUTS), seed)
-        curve = _fit(
-            network,
-            torch.from_numpy(standardise(obs, mean, std)),
-            torch.from_numpy(targets.astype(np.float32)),
-            # Of standardised columns, by noise of standard deviation 1.
-            torch.from_numpy((start_jitter_m * spec.start_effect / std).astype(np.float32)),
-            seed=seed,
-            steps=steps,
-            batch_size=batch_size,
-            lr=lr,
-            weight_decay=weight_decay,
-            progress=progress,
-        )
-    seconds = time.perf_counter() - started_s
+
+def trained_policy(
+    network: torch.nn.Sequential,
+    losses: Sequence[float],
+    data: TrainingSet,
+    settings: Settings,
+    seed: int,
+    selection: tuple[str, str],
+    seconds: float,
+) -> TrainedPolicy:
+    """Write the card of a trained network.
+
+    Args:
+        network: trained.
+        losses: of every batch.
+        data: that it was trained on.
+        settings: that it was trained with.
+        seed: of the initial weights, the batches and the noise.
+        selection: name and hash of the manifest.
+        seconds: that it took.
+
+    Raises:
+        PolicyError: if a weight is not finite.
+    """
+    curve = tuple(
+        (first + len(block), sum(block) / len(block))
+        for first in range(0, len(losses), CURVE_EVERY)
+        for block in [losses[first : first + CURVE_EVERY]]
+    )
+    topic_map = data.episodes[0][0].topic_map
     card = Card(
         id=new_episode_id(),
         created_at=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        variant=spec.variant,
-        columns=spec.columns,
-        phase_labels=spec.phase_labels,
-        action_scale=action.scale,
-        widths=(spec.width, *hidden, N_OUTPUTS),
-        topic_map_hash=chosen[0][0].topic_map.hash,
+        variant=data.spec.variant,
+        columns=data.spec.columns,
+        phase_labels=data.spec.phase_labels,
+        action_scale=settings.action_scale,
+        widths=data.widths(settings.hidden),
+        topic_map_hash=topic_map.hash,
         selection_name=selection[0],
         selection_hash=selection[1],
         episodes=tuple(
-            {"id": episode.id, "span": span and list(span), "n_steps": len(part)}
-            for (episode, span), part in zip(chosen, parts, strict=True)
+            {"id": episode.id, "span": span and list(span), "n_steps": n}
+            for (episode, span), n in zip(data.episodes, data.n_steps, strict=True)
         ),
         seed=seed,
-        steps=steps,
-        batch_size=batch_size,
-        lr=lr,
-        weight_decay=weight_decay,
-        std_floor=std_floor,
-        start_jitter_m=start_jitter_m,
-        clipped_fraction=n_clipped / len(obs),
+        steps=settings.steps,
+        batch_size=settings.batch_size,
+        lr=settings.lr,
+        weight_decay=settings.weight_decay,
+        std_floor=settings.std_floor,
+        start_jitter_m=settings.start_jitter_m,
+        clipped_fraction=data.clipped_fraction,
         curve=curve,
         seconds=seconds,
         versions={
@@ -159,15 +262,9 @@ def train(
             "curation_ros": curation_ros.__version__,
         },
     )
-    layers = [layer for layer in network if isinstance(layer, torch.nn.Linear)]
-    weights = [(_array(layer.weight), _array(layer.bias)) for layer in layers]
-    return TrainedPolicy(
-        Policy(card, weights, mean, std, f"policy {card.id}"),
-        network,
-        curve[-1][1],
-        curve,
-        seconds,
-    )
+    weights = [(_array(layer.weight), _array(layer.bias)) for layer in linear_layers(network)]
+    policy = Policy(card, weights, data.mean, data.std, f"policy {card.id}")
+    return TrainedPolicy(policy, network, curve[-1][1], curve, tuple(losses), seconds)
 
 
 def normalisation(obs: Floats, spec: ObservationSpec, std_floor: float) -> tuple[Floats, Floats]:
@@ -186,30 +283,24 @@ def normalisation(obs: Floats, spec: ObservationSpec, std_floor: float) -> tuple
     return mean, std
 
 
-def _check_settings(
-    seed: int,
-    steps: int,
-    batch_size: int,
-    lr: float,
-    weight_decay: float,
-    hidden: tuple[int, ...],
-    std_floor: float,
-    start_jitter_m: float,
-) -> None:
-    for name, value in (
-        ("steps", steps),
-        ("batch_size", batch_size),
-        ("hidden", min(hidden, default=0)),
-    ):
-        if value < 1:
-            raise PolicyError(f"training: {name} is {value}, expected at least 1")
-    for name, number in (("lr", lr), ("std_floor", std_floor)):
-        if not number > 0.0:
-            raise PolicyError(f"training: {name} is {number}, expected more than 0")
-    at_least_zero = {"seed": seed, "weight_decay": weight_decay, "start_jitter_m": start_jitter_m}
-    for name, number in at_least_zero.items():
-        if not number >= 0:
-            raise PolicyError(f"training: {name} is {number}, expected 0 or more")
+def check_seed(seed: int) -> None:
+    """Refuse a seed that torch's generators do not take.
+
+    Raises:
+        PolicyError: if it is negative.
+    """
+    if not seed >= 0:
+        raise PolicyError(f"training: seed is {seed}, expected 0 or more")
+
+
+def check_loss(loss: float, step: int) -> None:
+    """Refuse a loss that no training comes back from.
+
+    Raises:
+        PolicyError: if it is not finite.
+    """
+    if not math.isfinite(loss):
+        raise PolicyError(f"training: the loss is {loss} in step {step}, expected a finite number")
 
 
 def _sorted(episodes: Iterable[tuple[Episode, Span | None]]) -> list[tuple[Episode, Span | None]]:
@@ -231,8 +322,8 @@ def _sorted(episodes: Iterable[tuple[Episode, Span | None]]) -> list[tuple[Episo
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """The order of sums, and so the bits, depends on the number of threads."""
+def one_thread() -> Iterator[None]:
+    """One thread of torch: the order of sums, and so the bits, depends on their number."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -241,7 +332,13 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _network(widths: tuple[int, ...], seed: int) -> torch.nn.Sequential:
+def new_network(widths: tuple[int, ...], seed: int) -> torch.nn.Sequential:
+    """A network with initial weights.
+
+    Args:
+        widths: of the layers, from the observation to the output.
+        seed: of the weights.
+    """
     # torch's layers draw from the global generator, which is the caller's: it is put back.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -252,61 +349,57 @@ def _network(widths: tuple[int, ...], seed: int) -> torch.nn.Sequential:
     return torch.nn.Sequential(*modules)
 
 
-def _fit(
-    network: torch.nn.Sequential,
-    obs: torch.Tensor,
-    targets: torch.Tensor,
-    jitter: torch.Tensor,
-    *,
-    seed: int,
-    steps: int,
-    batch_size: int,
-    lr: float,
-    weight_decay: float,
-    progress: Progress | None,
-) -> tuple[tuple[int, float], ...]:
-    """Train in place.
+def linear_layers(network: torch.nn.Sequential) -> list[torch.nn.Linear]:
+    """The layers with weights, from the observation to the output."""
+    return [layer for layer in network if isinstance(layer, torch.nn.Linear)]
+
+
+def draws(
+    data: TrainingSet, settings: Settings, seed: int
+) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """What each step learns from, CURVE_EVERY steps at a time.
 
     Args:
-        network: to train.
-        obs: (N, D) float32, standardised.
-        targets: (N, 4) float32.
-        jitter: (S, D) float32, what noise of S values with standard deviation 1 adds to obs.
-        seed: of the batches and the noise.
-        steps: gradient steps.
-        batch_size: rows a step.
-        lr: learning rate.
-        weight_decay: L2 penalty.
-        progress: as in `train`.
+        data: with N rows, and a jitter of S values.
+        settings: with steps and batch size B.
+        seed: of the draws.
 
-    Returns:
-        The training curve.
+    Yields:
+        For n steps, (n, B) row indices and (n, B, S) float32 noise of standard deviation 1.
     """
     draw = torch.Generator().manual_seed(seed)
-    optimizer = torch.optim.Adam(network.parameters(), lr=lr, weight_decay=weight_decay)
-    curve: list[tuple[int, float]] = []
-    for first in range(0, steps, CURVE_EVERY):
-        n = min(CURVE_EVERY, steps - first)
-        picks = torch.randint(len(obs), (n, batch_size), generator=draw)
-        noise = torch.randn(n, batch_size, len(jitter), generator=draw)
-        total = 0.0
-        for k in range(n):
-            pick = picks[k]
-            seen = torch.addmm(obs[pick], noise[k], jitter)
-            loss = torch.nn.functional.mse_loss(network(seen), targets[pick])
+    for first in range(0, settings.steps, CURVE_EVERY):
+        shape = (min(CURVE_EVERY, settings.steps - first), settings.batch_size)
+        picks = torch.randint(len(data), shape, generator=draw)
+        yield picks, torch.randn(*shape, len(data.jitter), generator=draw)
+
+
+def _fit(
+    network: torch.nn.Sequential,
+    data: TrainingSet,
+    settings: Settings,
+    seed: int,
+    progress: Progress | None,
+) -> list[float]:
+    """Train in place; returns the loss of every batch."""
+    optimizer = torch.optim.Adam(
+        network.parameters(), lr=settings.lr, weight_decay=settings.weight_decay
+    )
+    losses: list[float] = []
+    for picks, noise in draws(data, settings, seed):
+        first = len(losses)
+        for pick, shift in zip(picks, noise, strict=True):
+            seen = torch.addmm(data.obs[pick], shift, data.jitter)
+            loss = torch.nn.functional.mse_loss(network(seen), data.targets[pick])
             value = loss.item()
-            if not math.isfinite(value):
-                raise PolicyError(
-                    f"training: the loss is {value} in step {first + k}, expected a finite number"
-                )
+            check_loss(value, len(losses))
             optimizer.zero_grad()
             torch.autograd.backward(loss)
             optimizer.step()
-            total += value
-        curve.append((first + n, total / n))
+            losses.append(value)
         if progress is not None:
-            progress(*curve[-1])
-    return tuple(curve)
+            progress(len(losses), sum(losses[first:]) / (len(losses) - first))
+    return losses
 
 
 def _array(parameter: torch.Tensor) -> Weights:
