@@ -19,6 +19,7 @@ BENCHMARKS = (
     "kill_cost",
     "many_episodes",
     "scorer_cost",
+    "training_speed",
 )
 
 

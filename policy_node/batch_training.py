@@ -238,7 +238,7 @@ def _fit(learners: Sequence[_Learner], settings: Settings, progress: JobProgress
             layer.bias.copy_(linear.bias)
     buffers = _Buffers(widths, settings)
     rows = {id(learner.data): _rows(learner.data) for learner in learners}
-    errors = torch.zeros(CURVE_EVERY, n, settings.batch_size, N_OUTPUTS)
+    errors = torch.zeros(CURVE_EVERY, n, N_OUTPUTS, settings.batch_size).transpose(2, 3)
     step_count = torch.zeros(())
     draw = [draws(learner.data, settings, learner.job.seed) for learner in learners]
     for blocks in zip(*draw, strict=True):
@@ -293,8 +293,12 @@ class _Buffers:
         self._row = torch.empty(settings.batch_size, widths[0] + N_OUTPUTS)
         self._obs, self._targets = self._row[:, : widths[0]], self._row[:, widths[0] :]
         # Of each layer what goes in, from the observations to the answer, and its gradient.
-        self._values = [torch.empty(settings.batch_size, width) for width in widths]
-        self._gradients = [torch.empty(settings.batch_size, width) for width in widths]
+        self._values = [_buffer(settings.batch_size, width) for width in widths]
+        self._gradients = [_buffer(settings.batch_size, width) for width in widths]
+        for k in range(1, len(widths) - 2):
+            if widths[k] == widths[k + 1]:
+                # When the one is written the other has been used: less memory to keep near.
+                self._gradients[k] = self._values[k + 1]
         self._gradients_t = [gradient.t() for gradient in self._gradients]
         self._is_shifted = settings.start_jitter_m > 0.0
         if not self._is_shifted:
@@ -330,6 +334,13 @@ class _Buffers:
                 torch.mm(gradient, layer.weight, out=gradients[k])
                 # After a ReLU: 1 where it let through, 0 where it did not.
                 gradients[k].mul_(values[k].sign_())
+
+
+def _buffer(n_rows: int, width: int) -> torch.Tensor:
+    """(n_rows, width), with the longer side contiguous: see `_layers`."""
+    if width < n_rows:
+        return torch.empty(width, n_rows).t()
+    return torch.empty(n_rows, width)
 
 
 def _rows(data: TrainingSet) -> torch.Tensor:

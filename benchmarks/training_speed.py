@@ -1,0 +1,200 @@
+"""Training: many policies in one computation, one after the other, and as people write it.
+
+All take turns in one process, one thread and one core, on the same demonstrations, and ratios are
+taken within a round. Each figure is the median over rounds of the seconds of a policy of 4000
+steps: of its preparation, and of fewer steps, brought to so many.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, TensorDataset
+
+from curation_ros.bags.reader import read_episode
+from curation_ros.core.episode import Episode
+from policy_node.batch_training import TrainingJob, train_many
+from policy_node.observation import Span
+from policy_node.train import Settings, TrainedPolicy, TrainingSet, new_network, train
+
+COMMAND = "python benchmarks/run.py training_speed"
+N_ROUNDS = 5
+N_STEPS = 800
+N_POLICIES = 10
+N_ALONE = 2
+"""Policies a round of those that are trained one after the other."""
+N_EPISODES, N_KEPT = 80, 60
+N_EQUAL = 100
+PAPER_STEPS = 4000
+TARGET_RATIO = 1.5
+TARGET_DIFFERENCE = 1e-5
+_SAMPLE = Path(__file__).resolve().parents[1] / "bags" / "sample"
+
+#: What `train` does when not told otherwise.
+SETTINGS = Settings(
+    steps=N_STEPS,
+    batch_size=256,
+    lr=1e-3,
+    weight_decay=1e-4,
+    hidden=(256, 256),
+    std_floor=2e-3,
+    start_jitter_m=0.0,
+    action_scale=0.2,
+)
+
+Demonstrations = list[tuple[Episode, Span | None]]
+
+
+def demonstrations(rng: np.random.Generator) -> Demonstrations:
+    """The sample, stretched to 300 to 500 steps, with other starts and a little noise."""
+    sample = read_episode(_SAMPLE)
+    made: Demonstrations = []
+    for k in range(N_EPISODES):
+        n_steps = int(rng.integers(300, 501))
+        rows = np.arange(n_steps) * len(sample) // n_steps
+        fields = {name: values[rows] for name, values in sample.fields.items()}
+        for name in ("eef_position", "bowl_position", "plate_position"):
+            fields[name] = fields[name] + rng.uniform(-0.05, 0.05, 3)
+        fields["twist"] = fields["twist"] + 0.01 * rng.standard_normal(fields["twist"].shape)
+        stamps = sample.stamps_ns[0] + 50_000_000 * np.arange(n_steps)
+        made.append((replace(sample, id=f"{k:02d}", stamps_ns=stamps, fields=fields), None))
+    return made
+
+
+def prepared(kept: Demonstrations) -> TrainingSet:
+    """Rows to learn from; every way of training begins with them."""
+    return TrainingSet(kept, "relative", SETTINGS)
+
+
+def train_by_data_loader(kept: Demonstrations, seed: int) -> None:
+    """The loop of tutorials: a data set of rows, shuffled batches, zero_grad, backward, step."""
+    data = prepared(kept)
+    network = new_network(data.widths(SETTINGS.hidden), seed)
+    torch.manual_seed(seed)
+    loader = DataLoader(
+        TensorDataset(data.obs, data.targets), batch_size=SETTINGS.batch_size, shuffle=True
+    )
+    optimizer = torch.optim.Adam(
+        network.parameters(), lr=SETTINGS.lr, weight_decay=SETTINGS.weight_decay
+    )
+    step = 0
+    while step < N_STEPS:
+        for obs, targets in loader:
+            loss = torch.nn.functional.mse_loss(network(obs), targets)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            step += 1
+            if step == N_STEPS:
+                break
+
+
+def measure(n_rounds: int = N_ROUNDS) -> list[dict[str, Any]]:
+    """All rows, measured in this process."""
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(0)
+    every = demonstrations(rng)
+    # Selections of the paper's size; each policy has its own.
+    kept = [
+        [every[i] for i in rng.choice(N_EPISODES, N_KEPT, replace=False)]
+        for _ in range(N_POLICIES)
+    ]
+    jobs = [TrainingJob(f"policy {k}", own, seed=k) for k, own in enumerate(kept)]
+
+    def one_after_the_other() -> list[TrainedPolicy]:
+        return [train(kept[k], seed=k, steps=N_STEPS) for k in range(N_ALONE)]
+
+    def together() -> list[TrainedPolicy]:
+        trained = list(train_many(jobs, steps=N_STEPS, group=N_POLICIES))
+        policies = [policy for policy in trained if isinstance(policy, TrainedPolicy)]
+        assert len(policies) == N_POLICIES
+        return policies
+
+    def by_data_loader() -> None:
+        train_by_data_loader(kept[0], 0)
+
+    ways: dict[str, tuple[int, Callable[[], list[TrainedPolicy] | None]]] = {
+        "alone": (N_ALONE, one_after_the_other),
+        "together": (N_POLICIES, together),
+        "data loader": (1, by_data_loader),
+    }
+    train(kept[0], seed=0, steps=1)  # torch loads what its optimizers need
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    difference = 0.0
+    for _ in range(n_rounds):
+        results = {}
+        started_s = time.perf_counter()
+        prepared(kept[0])
+        preparation_s = time.perf_counter() - started_s
+        for name, (n_policies, way) in ways.items():
+            started_s = time.perf_counter()
+            results[name] = way()
+            steps_s = (time.perf_counter() - started_s) / n_policies - preparation_s
+            seconds[name].append(preparation_s + steps_s * PAPER_STEPS / N_STEPS)
+        for a, b in zip(results["alone"] or [], results["together"] or [], strict=False):
+            gaps = np.abs(np.subtract(a.losses[:N_EQUAL], b.losses[:N_EQUAL]))
+            difference = max(difference, float(gaps.max()))
+
+    def ratio(slow: str) -> float:
+        pairs = zip(seconds[slow], seconds["together"], strict=True)
+        return statistics.median(a / b for a, b in pairs)
+
+    def row(name: str, value: float, unit: str, **extra: float | str | bool) -> dict[str, Any]:
+        empty = {"against": "", "ratio": None, "target": None, "holds": None}
+        return {"name": name, "value": value, "unit": unit, **empty, **extra, "command": COMMAND}
+
+    median = {name: statistics.median(values) for name, values in seconds.items()}
+    unit = "s/policy"
+    return [
+        row("training, one policy after the other", median["alone"], unit),
+        row(
+            f"training, {N_POLICIES} policies in one computation",
+            median["together"],
+            unit,
+            against="training, one policy after the other",
+            ratio=ratio("alone"),
+            target=f"ratio >= {TARGET_RATIO}",
+            holds=ratio("alone") >= TARGET_RATIO,
+        ),
+        row(
+            "training, DataLoader loop",
+            median["data loader"],
+            unit,
+            against=f"training, {N_POLICIES} policies in one computation",
+            ratio=ratio("data loader"),
+        ),
+        row(
+            f"training, largest difference of the first {N_EQUAL} losses",
+            difference,
+            "",
+            against="training, one policy after the other",
+            target=f"<= {TARGET_DIFFERENCE}",
+            holds=difference <= TARGET_DIFFERENCE,
+        ),
+    ]
+
+
+def run() -> list[dict[str, Any]]:
+    """Measure in a process of its own, with one thread on one core, and return its rows."""
+    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    done = subprocess.run(
+        [sys.executable, __file__], env={**os.environ, **one}, check=True, stdout=subprocess.PIPE
+    )
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+if __name__ == "__main__":
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    for result in measure():
+        print(json.dumps(result))
