@@ -14,7 +14,7 @@ import torch
 from torch.optim.adam import adam
 
 from curation_ros.core.episode import Episode
-from curation_ros.core.errors import PolicyError
+from curation_ros.core.errors import CurationError, PolicyError
 from policy_node.action import N_OUTPUTS
 from policy_node.observation import Span
 from policy_node.train import (
@@ -31,8 +31,9 @@ from policy_node.train import (
     trained_policy,
 )
 
-GROUP = 10
-"""Policies in one computation."""
+GROUP = 2
+"""Policies in one computation. More share the work of the optimizer, but parameters and moments
+of each are 1.2 MB, which crowd the cache of a core; benchmarks/training_speed.py has both."""
 
 JobProgress = Callable[[str, int, float], None]
 
@@ -107,9 +108,9 @@ def train_many(
         progress: called for each job with key, step and mean loss as `train` does.
 
     Returns:
-        An iterator in the order of the jobs. A job with a negative seed, unusable episodes or a
-        loss that is not finite is a FailedTraining; the others go on. `seconds` of a policy are
-        its share of its group's.
+        An iterator in the order of the jobs; each step of it that needs a group trains it. A job
+        with a seed out of range, unusable episodes or a loss that is not finite is a
+        FailedTraining; the others go on. `seconds` of a policy are its share of its group's.
 
     Raises:
         PolicyError: at once, if a setting is out of range or a key is given twice.
@@ -153,7 +154,7 @@ def _train_group(
             check_seed(job.seed)
             if same not in sets:
                 sets[same] = TrainingSet(job.episodes, job.variant, settings)
-        except PolicyError as err:
+        except CurationError as err:
             done[job.key] = FailedTraining(job.key, str(err))
         else:
             learners.append(_Learner(job, sets[same], settings))

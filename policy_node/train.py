@@ -287,10 +287,10 @@ def check_seed(seed: int) -> None:
     """Refuse a seed that torch's generators do not take.
 
     Raises:
-        PolicyError: if it is negative.
+        PolicyError: if it is negative or has more than 63 bits.
     """
-    if not seed >= 0:
-        raise PolicyError(f"training: seed is {seed}, expected 0 or more")
+    if not 0 <= seed < 2**63:
+        raise PolicyError(f"training: seed is {seed}, expected 0 or more and less than 2**63")
 
 
 def check_loss(loss: float, step: int) -> None:

@@ -21,8 +21,9 @@ def test_acting_needs_neither_torch_nor_simulator_nor_ros(module):
 
 
 @pytest.mark.policy
-def test_training_needs_neither_simulator_nor_ros():
-    run_with_blocked("policy_node.train", (*HEAVY[1:], *ROS))
+@pytest.mark.parametrize("module", ["train", "batch_training"])
+def test_training_needs_neither_simulator_nor_ros(module):
+    run_with_blocked(f"policy_node.{module}", (*HEAVY[1:], *ROS))
 
 
 @pytest.mark.sim

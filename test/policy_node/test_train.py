@@ -205,6 +205,7 @@ def test_loss_that_is_not_finite_is_refused_with_its_step():
         ({"variant": "pixels"}, "pixels"),
         ({"action_scale": 0.0}, "action scale"),
         ({"seed": -1}, "seed"),
+        ({"seed": 2**63}, "seed"),
     ],
 )
 def test_setting_out_of_range_is_refused(settings, word):
