@@ -67,10 +67,12 @@ def read_curation(config: Path | None, overrides: Mapping[str, Any]) -> Curation
     where = f"curation config {config}"
     settings = {} if config is None else _read_settings(config, where)
     given = {k: v for k, v in overrides.items() if v}
+    if given.get("rule", settings.get("rule")) != settings.get("rule"):
+        settings.pop("rule_params", None)  # they are of the rule of the file
     settings.update(given)
-    if "scorers" in given:
-        names = list(given["scorers"])
-        if settings.get("rule") == "none":
+    if "scorers" in given or "rule_scorer" in given:
+        names = list(settings.get("scorers", _DEFAULTS["scorers"].default))
+        if settings.get("rule") == "none" and "rule_scorer" not in given:
             settings["rule_scorer"] = names[0]  # nothing decides
         decides = settings.get("rule_scorer", _DEFAULTS["rule_scorer"].default)
         settings["scorers"] = [*names, *(n for n in [decides] if n not in names)]

@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
             print_json(row)
         else:
             rows.append(row)
-    if not args.json:
+    if rows:
         for line in curation.describe().splitlines():
             progress_console.print(line, style="dim", markup=False)
         console.print(_table(rows, curation))

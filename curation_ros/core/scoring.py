@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
@@ -126,10 +127,18 @@ class Curation:
         return scorer
 
     def _make_rule(self) -> Rule:
+        rule = RULES[self.rule]
+        known = [n for n in inspect.signature(rule).parameters if n != "scorer"]
+        for key in self.rule_params:
+            if key not in known:
+                raise ConfigError(
+                    f"rule {self.rule!r} has no parameter {key!r}; it has "
+                    f"{', '.join(known) or 'none'}"
+                )
         try:
-            return RULES[self.rule](scorer=self.rule_scorer, **self.rule_params)
+            return rule(scorer=self.rule_scorer, **self.rule_params)
         except TypeError as err:
-            raise ConfigError(f"rule {self.rule!r}: {err}") from err
+            raise ConfigError(f"rule {self.rule!r}: {self.rule_params}: {err}") from err
 
     def fit(self, reference: Iterable[Episode]) -> Self:
         """Learn from trusted episodes; what was learned before is forgotten.

@@ -95,6 +95,20 @@ def test_scorer_that_decides_is_added_to_those_that_are_asked_for(tmp_path: Path
     assert undecided.scorers == ("length",)
 
 
+def test_scorer_that_is_asked_to_decide_is_computed(tmp_path: Path) -> None:
+    curation = read_curation(None, {"rule_scorer": "knn_label_free"})
+    assert curation.rule_scorer == "knn_label_free"
+    assert curation.scorers == (*DEFAULT_SCORERS, "knn_label_free")
+
+
+def test_parameters_of_the_file_s_rule_are_not_those_of_another(tmp_path: Path) -> None:
+    config = tmp_path / "c.yaml"
+    config.write_text("rule: threshold\nrule_params: {threshold: 0.5}\n")
+    assert read_curation(config, {}).rule_params == {"threshold": 0.5}
+    assert read_curation(config, {"rule": "threshold"}).rule_params == {"threshold": 0.5}
+    assert read_curation(config, {"rule": "gap"}).rule_params == {}
+
+
 @pytest.mark.parametrize(
     ("settings", "said"),
     [

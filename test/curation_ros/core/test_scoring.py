@@ -287,7 +287,8 @@ def test_unfitted_curation_raises(rng: np.random.Generator) -> None:
         ({"scorer_params": {"smoothness": {"gripper_channel": "False"}}}, ["'False'"]),
         ({"scorer_params": {"entropy": {"over": "x"}}}, ["over", "values"]),
         ({"scorers": ["gripper_timing"], "scorer_params": {"knn": {}}}, ["knn"]),
-        ({"rule_params": {"limit": 3}}, ["limit"]),
+        ({"rule_params": {"limit": 3}}, ["'limit'", "threshold", "false_alarm"]),
+        ({"rule": "gap", "rule_params": {"value": 3}}, ["rule 'gap'", "'value'", "has method"]),
         ({"rule_params": {"threshold": "high"}}, ["threshold"]),
     ],
 )
