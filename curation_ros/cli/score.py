@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,8 @@ def run(args: argparse.Namespace) -> int:
     dataset = _dataset(args) if args.write else None
     curation.fit(read_reference(args.reference, topic_map) if args.reference else [])
     rows: list[dict[str, Any]] = []
-    n_read, n_known, n_bad = 0, 0, 0
+    n_read, n_bad = 0, 0
+    n_known: Counter[bool] = Counter()
     flawed = False
     bags, missing = _find(args.paths)
     for path, problem in missing:
@@ -80,8 +82,8 @@ def run(args: argparse.Namespace) -> int:
         curation, topic_map, jobs=args.jobs, backend=args.backend, fresh=args.fresh
     )
 
-    def bar(results: Iterable[Examined]) -> Iterable[Examined]:
-        return track(
+    def bar(results: Iterable[Examined]) -> Iterator[Examined]:
+        shown = track(
             results,
             "scoring",
             total=len(bags),
@@ -89,6 +91,10 @@ def run(args: argparse.Namespace) -> int:
             transient=True,
             disable=len(bags) < _FEW or not progress_console.is_terminal,
         )
+        # A rule over the dataset goes over all bags twice; what is known counts the first time.
+        for one in shown:
+            n_known.update([one.is_known])
+            yield one
 
     judged = judge_bags(examiner, curation, bags, tie=_tie(dataset), progress=bar)
     for one, decision in judged:
@@ -97,7 +103,6 @@ def run(args: argparse.Namespace) -> int:
             _report(args, one.path, one.result)
             continue
         n_read += 1
-        n_known += one.is_known
         if dataset is not None:
             # A person's decision stays in force, beside the scores and findings of now.
             decision = replace(
@@ -118,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     if examiner.problem:
         warn(f"results could not be kept for the next time: {examiner.problem}")
     if len(bags) >= _FEW and (progress_console.is_terminal or not args.json):
-        text = f"scored {n_read}, of which {n_known} were known; {n_bad} could not be read"
+        text = f"scored {n_read}, of which {n_known[True]} were known; {n_bad} could not be read"
         progress_console.print(text, style="dim", highlight=False)
     if not n_read:
         return _NOTHING
