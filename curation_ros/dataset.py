@@ -55,7 +55,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _named_errors(path: Path) -> Iterator[None]:
+def named_errors(path: Path) -> Iterator[None]:
     """What the system refuses becomes an error for people, with the file's name."""
     try:
         yield
@@ -63,7 +63,7 @@ def _named_errors(path: Path) -> Iterator[None]:
         raise CurationError(f"{err.filename or path}: {err.strerror or err}") from err
 
 
-def _append_line(path: Path, record: Mapping[str, Any]) -> None:
+def append_line(path: Path, record: Mapping[str, Any]) -> None:
     """Append one JSON line and sync it; a torn last line (a crash) is ended first."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+b") as out:
@@ -78,10 +78,10 @@ def _append_line(path: Path, record: Mapping[str, Any]) -> None:
         os.fsync(out.fileno())
 
 
-def _read_lines(path: Path) -> list[dict[str, Any]]:
+def read_lines(path: Path) -> list[dict[str, Any]]:
     """Whole JSON lines of a log; a torn line is skipped, a missing file is empty."""
     try:
-        with _named_errors(path):
+        with named_errors(path):
             lines = path.read_bytes().splitlines()
     except CurationError as err:
         if isinstance(err.__cause__, FileNotFoundError):
@@ -153,7 +153,7 @@ class Dataset:
         with self.index.transaction() as db:
             named = dict(db.execute("SELECT id, name FROM episodes"))
         for log in (self.path / "decisions").glob("*.jsonl"):
-            lines = _read_lines(log)
+            lines = read_lines(log)
             named.setdefault(log.stem, str(lines[-1].get("name", "")) if lines else "")
         return sorted(named.items())
 
@@ -179,7 +179,7 @@ class Dataset:
         """
         log = self.decision_log(episode_id)
         try:
-            return [Decision.from_json(line) for line in _read_lines(log)]
+            return [Decision.from_json(line) for line in read_lines(log)]
         except EpisodeError as err:
             raise EpisodeError(f"{log}: {err}") from err
 
@@ -224,11 +224,11 @@ class Dataset:
         """
         log = self.decision_log(decision.episode)
         # The lock makes numbering and appending one step when curator and CLI decide at once.
-        with _named_errors(log), _locked(log.parent):
+        with named_errors(log), _locked(log.parent):
             if not amend:
                 revisions = [d.revision for d in self.decisions(decision.episode)]
                 decision = replace(decision, revision=max(revisions, default=0) + 1)
-            _append_line(log, decision.to_json())
+            append_line(log, decision.to_json())
         with suppress(CurationError), self.index.transaction() as db:
             _index_decision(db, decision)
         return decision
@@ -261,13 +261,13 @@ class Dataset:
             CurationError: if it cannot be written.
         """
         path = self.path / "truth.jsonl"
-        with _named_errors(path):
-            _append_line(path, record)
+        with named_errors(path):
+            append_line(path, record)
 
     def truth(self) -> dict[str, dict[str, Any]]:
         """Merged truth lines by episode id; later lines win."""
         merged: dict[str, dict[str, Any]] = {}
-        for line in _read_lines(self.path / "truth.jsonl"):
+        for line in read_lines(self.path / "truth.jsonl"):
             merged.setdefault(str(line.get("episode")), {}).update(line)
         return merged
 
@@ -279,7 +279,7 @@ class Dataset:
         """
         path = self.path / "selections" / f"{manifest.name}.json"
         text = json.dumps(manifest.to_json(), indent=1, allow_nan=False) + "\n"
-        with _named_errors(path), _locked(path.parent):
+        with named_errors(path), _locked(path.parent):
             if path.exists():
                 raise CurationError(f"selection {path} exists: choose another --name")
             write_atomically(path, text)

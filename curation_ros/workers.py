@@ -40,6 +40,11 @@ def check_workers(jobs: int, backend: str) -> None:
         raise ConfigError(f"jobs {jobs}: expected a number of workers, or -1 for all cores")
 
 
+def in_flight(jobs: int, backend: str, ray_ahead: int = _RAY_AHEAD) -> int:
+    """Most tasks that `spread` has handed out and not given the results of."""
+    return ray_ahead * max(jobs, _RAY_AHEAD) if backend == "ray" else AHEAD * jobs
+
+
 def spread(
     function: Callable[..., Result],
     tasks: Iterable[tuple[Any, ...]],
@@ -78,7 +83,7 @@ def spread(
         if backend == "ray":
             parallel = Parallel(n_jobs=jobs)
             ahead = iter(tasks)
-            while window := list(islice(ahead, ray_ahead * max(jobs, _RAY_AHEAD))):
+            while window := list(islice(ahead, in_flight(jobs, backend, ray_ahead))):
                 yield from parallel(delayed(function)(*task) for task in window)
         else:
             kind = "generator" if in_order else "generator_unordered"

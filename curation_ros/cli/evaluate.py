@@ -1,4 +1,4 @@
-"""`curation evaluate`: how often a policy succeeds, in one process or over the graph."""
+"""`curation evaluate`: how often a policy succeeds, in our own processes or over the graph."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from curation_ros.cli.arguments import add_workers
 from curation_ros.cli.output import percent, print_json, say
 from curation_ros.evaluating import evaluate_on_graph, summary
+from curation_ros.workers import spread
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--graph", action="store_true", help="drive sim_node and policy_node over ROS 2"
     )
+    add_workers(parser)
     parser.add_argument("--logs", type=Path, help="with --graph: folder for the nodes' output")
 
 
@@ -54,11 +57,9 @@ def _rollouts(args: argparse.Namespace, policy: Any) -> Iterator[dict[str, Any]]
             args.policy, policy.id, args.starts, max_steps=args.max_steps, log_folder=logs
         )
         return
-    from policy_node.rollouts import rollout
-    from sim_node.env import LiberoEnv
-    from sim_node.starts import start_by_name, start_names
+    from curation_ros.judging import roll_policy
+    from sim_node.starts import start_names
 
-    names = start_names(args.starts)
-    with LiberoEnv() as env:
-        for name in names:
-            yield rollout(env, start_by_name(name), policy, args.max_steps).to_json()
+    tasks = [(args.policy, name, args.max_steps) for name in start_names(args.starts)]
+    for done in spread(roll_policy, tasks, jobs=args.jobs, backend=args.backend):
+        yield done.to_json()
