@@ -79,7 +79,8 @@ def make_episode(
     grasp_at = CLOSE_AT if close_at is None else close_at
     lift_at, transport_at = grasp_at + GRASP_STEPS, grasp_at + GRASP_STEPS + LIFT_STEPS
     starts = [0, int(0.6 * grasp_at), grasp_at, lift_at, transport_at, release_at]
-    phase = np.searchsorted(starts, step, side="right") - 1.0
+    # A release that comes before a phase begins leaves that phase out.
+    phase = np.searchsorted(np.minimum(starts, release_at), step, side="right") - 1.0
 
     velocity = np.array(
         [[0.1, 0.05, -0.08], [0, 0, -0.2], [0, 0, 0], [0, 0, 0.2], [0.05, 0.15, -0.05], [0, 0, 0]]
