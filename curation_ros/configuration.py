@@ -101,8 +101,13 @@ def _read_settings(config: Path, where: str) -> dict[str, Any]:
         if not all(isinstance(name, str) for name in raw.get(key, ())):
             raise ConfigError(f"{where}: {key!r} is {raw[key]!r:.60}, expected names of scorers")
     for name, params in raw.get("scorer_params", {}).items():
-        if not isinstance(params, dict) or not all(isinstance(key, str) for key in params):
+        if not isinstance(params, dict):
             raise ConfigError(f"{where}: parameters of {name!r} are {params!r:.60}: no mapping")
+        if not all(isinstance(key, str) for key in params):
+            raise ConfigError(
+                f"{where}: parameters of {name!r} are {params!r:.60}: expected names; "
+                "quote 'on', which YAML reads as true"
+            )
     return raw
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -303,14 +303,20 @@ def log_decision(dataset: Dataset, decision: Decision) -> Decision:
     Returns:
         The decision in force: a person's, where a person has decided.
     """
-    known = dataset.decisions(decision.episode)
-    own = in_force(d for d in known if d.by == CURATOR).get(decision.episode)
-    if own is None or not _says_the_same(own, decision):
-        known.append(dataset.append_decision(decision))
-    elif not decision.evidence.items() <= own.evidence.items():
-        same = replace(decision, revision=own.revision)
-        known.append(dataset.append_decision(same, amend=True))
-    return in_force(known)[decision.episode]
+
+    def own(known: Sequence[Decision]) -> Decision | None:
+        return in_force(d for d in known if d.by == CURATOR).get(decision.episode)
+
+    def is_said(known: Sequence[Decision]) -> bool:
+        last = own(known)
+        return last is not None and _says_the_same(last, decision)
+
+    # Others may decide on the same episode at the same time.
+    if dataset.append_decision(decision, unless=is_said) is None:
+        last = own(dataset.decisions(decision.episode))
+        if last is not None and not decision.evidence.items() <= last.evidence.items():
+            dataset.append_decision(replace(decision, revision=last.revision), amend=True)
+    return in_force(dataset.decisions(decision.episode))[decision.episode]
 
 
 def override(
@@ -328,7 +334,9 @@ def override(
     previous = known[-1] if known else _undecided(dataset, episode_id, state_hash)
     text = f"{by}: {reason}" if reason else f"{by} decided"
     verdict_: Any = verdict
-    return dataset.append_decision(decisions.override(previous, verdict_, text, by=by))
+    logged = dataset.append_decision(decisions.override(previous, verdict_, text, by=by))
+    assert logged is not None, "nothing was said that would stop it"
+    return logged
 
 
 def _undecided(dataset: Dataset, episode_id: str, state_hash: str) -> Decision:

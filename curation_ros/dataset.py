@@ -12,7 +12,7 @@ import json
 import os
 import sqlite3
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property
@@ -209,15 +209,22 @@ class Dataset:
 
         return key
 
-    def append_decision(self, decision: Decision, *, amend: bool = False) -> Decision:
+    def append_decision(
+        self,
+        decision: Decision,
+        *,
+        amend: bool = False,
+        unless: Callable[[Sequence[Decision]], bool] | None = None,
+    ) -> Decision | None:
         """Log a decision under the next revision number, on disk when this returns.
 
         Args:
             decision: its own revision number counts only to amend.
             amend: log it under its own number (the same decision with more evidence).
+            unless: is shown what is logged already; where it says so, nothing is added.
 
         Returns:
-            The decision with the revision that it got.
+            The decision with the revision that it got; None if it was not wanted any more.
 
         Raises:
             CurationError: if the log cannot be written.
@@ -225,8 +232,11 @@ class Dataset:
         log = self.decision_log(decision.episode)
         # The lock makes numbering and appending one step when curator and CLI decide at once.
         with named_errors(log), _locked(log.parent):
+            known = self.decisions(decision.episode)
+            if unless is not None and unless(known):
+                return None
             if not amend:
-                revisions = [d.revision for d in self.decisions(decision.episode)]
+                revisions = [d.revision for d in known]
                 decision = replace(decision, revision=max(revisions, default=0) + 1)
             append_line(log, decision.to_json())
         with suppress(CurationError), self.index.transaction() as db:

@@ -278,7 +278,11 @@ class Copies:
 def with_copy(seen: Examination, original: tuple[str, str]) -> Examination:
     """An examination with the finding that another episode (id, name) has the same content."""
     # Its id alone: whether its name is known already depends on when one asks.
-    message = f"same content as episode {original[0]}"
+    message = (
+        "the same episode is there more than once"
+        if original[0] == seen.episode
+        else f"same content as episode {original[0]}"
+    )
     return replace(seen, findings=(*seen.findings, Finding("duplicate", message, seen.span)))
 
 

@@ -40,6 +40,8 @@ def save_selection(
         CurationError: if there is no bag, or the name is taken.
     """
     ranks = rule not in ("decisions", "all")
+    if scorer and not ranks:
+        raise ConfigError(f"keep rule {rule!r} ranks nothing: --scorer {scorer} needs a --rule")
     if ranks and not scorer:
         raise ConfigError(f"keep rule {rule!r} ranks by a scorer: name one")
     bags = list(dataset.bags())
@@ -59,8 +61,8 @@ def save_selection(
     ]
     if ranks and all(c.score is None for c in candidates):
         raise ConfigError(
-            f"dataset {dataset.path}: no episode has a score of {scorer!r}: run "
-            f"curation score {dataset.path} --write"
+            f"dataset {dataset.path}: no episode has a logged score of {scorer!r}: run "
+            f"curation score {dataset.path} --write --scorers {scorer}"
         )
     resolution = SCORERS[scorer]().resolution if scorer in SCORERS else 0.0
     chosen = select(

@@ -6,9 +6,12 @@ import logging
 import os
 import signal
 import sys
+import threading
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import cache, partial
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -20,6 +23,8 @@ BACKENDS = ("loky", "ray", "dask")
 AHEAD = 2
 # Tasks that a Ray worker is given at a time.
 _RAY_AHEAD = 4
+# How often a worker looks whether somebody still wants its results.
+_WATCH_S = 0.5
 
 Result = TypeVar("Result")
 
@@ -88,7 +93,27 @@ def spread(
         else:
             kind = "generator" if in_order else "generator_unordered"
             parallel = Parallel(n_jobs=jobs, return_as=kind, pre_dispatch=f"{AHEAD} * n_jobs")
-            yield from parallel(delayed(function)(*task) for task in tasks)
+            call = delayed(partial(_with_parent, function) if backend == "loky" else function)
+            yield from parallel(call(*task) for task in tasks)
+
+
+def _with_parent(function: Callable[..., Result], *task: Any) -> Result:
+    """Call a function in a worker that is not to outlive the process that asked for it."""
+    _watch_parent()
+    return function(*task)
+
+
+@cache
+def _watch_parent() -> None:
+    """Once a process: end it when its parent has gone, as one that is killed cannot do that."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_WATCH_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="watch-parent", daemon=True).start()
 
 
 @contextmanager

@@ -620,7 +620,9 @@ def _event_of(bag: Bag, topic_map: TopicMap, clock: Stamps) -> EpisodeEvent:
     if event.end_ns is None:  # the recorder died before it was said
         kind: EventKind = "aborted" if event.event == "aborted" else "ended"
         event = replace(event, event=kind, end_ns=max([event.start_ns, *clock.tolist()]))
-    if _UUID.fullmatch(bag.name) and bag.name != event.id and bag.event() is not None:
+    # In a dataset the folder is the episode's name; elsewhere people name folders as they like.
+    is_named = _UUID.fullmatch(bag.name) or bag.path.resolve().parent.name == "episodes"
+    if is_named and bag.name != event.id and bag.event() is not None:
         line = f"wrong-id: the folder {bag.name} has the bag of episode {event.id}"
         event = replace(event, reason="\n".join(filter(None, [event.reason, line])))
     if bag.custom_data.get("recovered") == "true":

@@ -31,27 +31,35 @@ DONE, FINDINGS, USAGE, NOTHING, FAULT = 0, 1, 2, 3, 70
 _INTERRUPTED = 130
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command line, with the arguments of every subcommand."""
+def parser(command: str = "") -> argparse.ArgumentParser:
+    """The command line.
+
+    Args:
+        command: the subcommand whose arguments are wanted; empty: all of them. Importing all
+            modules takes a second.
+    """
     top = argparse.ArgumentParser(
         prog="curation",
         description="Curate robot demonstrations: score, decide, select, train, evaluate.",
         epilog="Exit codes: 0 done, 1 findings (with --check), 2 usage, 3 nothing could be done, "
-        "70 a fault of ours.",
+        "70 a fault of ours, 130 interrupted.",
     )
     top.add_argument("--version", action="version", version=f"curation_ros {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (module, text) in COMMANDS.items():
-        command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:])
-        command.add_argument("--json", action="store_true", help="JSON lines on stdout, no tables")
-        importlib.import_module(module).add_arguments(command)
+        one = commands.add_parser(name, help=text, description=text[0].upper() + text[1:])
+        one.add_argument("--json", action="store_true", help="JSON lines on stdout, no tables")
+        if command in ("", name):
+            importlib.import_module(module).add_arguments(one)
     return top
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand; a user never sees a traceback for bad input."""
-    args = parser().parse_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
+    chosen = next((word for word in words if not word.startswith("-")), "-")
     try:
+        args = parser(chosen).parse_args(words)
         code: int = importlib.import_module(COMMANDS[args.command][0]).run(args)
     except ConfigError as err:
         return _complain(err, USAGE)
@@ -63,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except ImportError as err:
-        return _complain(f"{args.command} needs {err.name}: install its extra", USAGE)
+        return _complain(f"{chosen} needs {err.name}: install its extra", USAGE)
     except Exception as err:
         if os.environ.get("CURATION_TRACEBACK"):
             raise

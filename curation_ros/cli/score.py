@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from rich.progress import track
 from rich.table import Table
@@ -17,7 +17,7 @@ from curation_ros.bags.reader import find_bags
 from curation_ros.cli.arguments import add_config, add_reference, add_workers
 from curation_ros.cli.output import VERDICT_STYLE, console, print_json, progress_console, warn
 from curation_ros.configuration import read_curation, read_reference, share_file
-from curation_ros.core.decisions import Decision
+from curation_ros.core.decisions import VERDICTS, Decision
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.examination import Examination
 from curation_ros.core.rules import RULES
@@ -32,6 +32,7 @@ from curation_ros.examining import EpisodesOf, Examined, Examiner, judge_bags
 _DONE, _FINDINGS, _NOTHING = 0, 1, 3
 _FIXED_WIDTH, _SCORE_WIDTH = 64, 12
 _FEW = 5
+_Judged: TypeAlias = "tuple[Examined, Decision | None]"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,8 +70,9 @@ def run(args: argparse.Namespace) -> int:
     dataset = _dataset(args) if args.write else None
     curation.fit(read_reference(args.reference, topic_map) if args.reference else [])
     rows: list[dict[str, Any]] = []
-    n_read, n_bad = 0, 0
+    n_bad, n_twice = 0, 0
     n_known: Counter[bool] = Counter()
+    verdicts: Counter[str] = Counter()
     flawed = False
     bags, missing = _find(args.paths)
     for path, problem in missing:
@@ -97,19 +99,15 @@ def run(args: argparse.Namespace) -> int:
             yield one
 
     judged = judge_bags(examiner, curation, bags, tie=_tie(dataset), progress=bar)
-    for one, decision in judged:
+    for one, decision in _resumable(judged):
         if decision is None or not isinstance(one.result, Examination):
             n_bad += 1
             _report(args, one.path, one.result)
             continue
-        n_read += 1
         if dataset is not None:
-            # A person's decision stays in force, beside the scores and findings of now.
-            decision = replace(
-                log_decision(dataset, decision),
-                scores=decision.scores,
-                findings=decision.findings,
-            )
+            decision = _logged(dataset, one.path, decision)
+        verdicts[decision.verdict] += 1
+        n_twice += decision.episode in curation.reference_ids_
         flawed = flawed or bool(decision.findings)
         row = decision_row(one.path, one.result, decision)
         if args.json:
@@ -118,16 +116,47 @@ def run(args: argparse.Namespace) -> int:
             rows.append(row)
     if rows:
         for line in curation.describe().splitlines():
-            progress_console.print(line, style="dim", markup=False)
+            # What a scorer is set to stands in the configuration; that it is silent, nowhere else.
+            if not line.startswith("scorer ") or "; abstains: " in line:
+                progress_console.print(line, style="dim", markup=False)
         console.print(_table(rows, curation))
+    n_read = sum(verdicts.values())
+    if n_twice:
+        warn(
+            f"{n_twice} of the {n_read} episodes are in the reference: what they are compared "
+            "with is partly themselves"
+        )
     if examiner.problem:
         warn(f"results could not be kept for the next time: {examiner.problem}")
     if len(bags) >= _FEW and (progress_console.is_terminal or not args.json):
+        found = ", ".join(f"{verdicts[v]} {v}" for v in VERDICTS if verdicts[v])
         text = f"scored {n_read}, of which {n_known[True]} were known; {n_bad} could not be read"
-        progress_console.print(text, style="dim", highlight=False)
+        progress_console.print(f"{found}; {text}" if found else text, style="dim")
     if not n_read:
         return _NOTHING
     return _FINDINGS if args.check and (flawed or n_bad) else _DONE
+
+
+def _resumable(judged: Iterator[_Judged]) -> Iterator[_Judged]:
+    """The same; who stops it is told that nothing is lost."""
+    try:
+        yield from judged
+    except KeyboardInterrupt:
+        warn("what has been scored is kept: the same command goes on from there")
+        raise
+
+
+def _logged(dataset: Dataset, path: Path, decision: Decision) -> Decision:
+    """Log a decision; a person's stays in force, beside the scores and findings of now."""
+    if path.name != decision.episode:
+        warn(
+            f"{path}: not logged: its folder is not named after its episode; "
+            f"rename it to {decision.episode}"
+        )
+        return decision
+    return replace(
+        log_decision(dataset, decision), scores=decision.scores, findings=decision.findings
+    )
 
 
 def _curation(args: argparse.Namespace) -> Curation:

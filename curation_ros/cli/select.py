@@ -24,8 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the manifest."""
+    dataset = Dataset(args.dataset)
     manifest, path = save_selection(
-        Dataset(args.dataset),
+        dataset,
         rule=args.rule,
         value=args.value,
         scorer=args.scorer,
@@ -37,6 +38,14 @@ def run(args: argparse.Namespace) -> int:
         print_json({"manifest": str(path), "kept": kept, "of": manifest.kept_of})
     else:
         say(f"kept {kept} of {manifest.kept_of}: {path}")
+        if args.rule != "decisions":
+            decided = dataset.latest_decisions()
+            doubted = sum(
+                e.episode in decided and decided[e.episode].verdict in ("review", "discard")
+                for e in manifest.entries
+            )
+            if doubted:
+                say(f"{doubted} of these are decided to be reviewed or discarded")
         if manifest.abstained:
             say(f"{len(manifest.abstained)} could not be judged")
     return 0

@@ -447,7 +447,7 @@ def _by_id(episode_id: str) -> str:
 def _enough(rule: Rule, scores: Mapping[str, float]) -> None:
     if len(scores) < rule.min_episodes:
         raise EpisodeError(
-            f"the rule needs {rule.min_episodes} scored episodes; so far there are {len(scores)}"
+            f"the rule needs {rule.min_episodes} scored episodes; there are {len(scores)}"
         )
 
 

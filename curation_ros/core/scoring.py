@@ -32,6 +32,8 @@ NO_REFERENCE = "no reference"
 NO_DATASET = "it compares with the whole dataset, which was not given"
 #: Checks that read the gripper's command: void where its meaning is in doubt.
 _BY_GRIPPER = ("clipped-start", "never-grasped", "opened-early", "unfinished")
+#: Refused references that are named; a mistake in a topic map is one of all of them.
+_SHOWN = 3
 #: Raised when the meaning of the state hash, or what an examination finds, changes.
 _STATE_VERSION = 2
 #: References are scored by scorers that were fitted without them; above this many, in groups.
@@ -279,6 +281,9 @@ class Curation:
         if rule.needs != "dataset":
             return self.ruling_
         known = {k: v for k, v in scores.items() if v is not None}
+        if self.rule_scorer in self.unfitted_:
+            why = f"{self.rule_scorer} cannot tell: {self.unfitted_[self.rule_scorer]}"
+            return self._ruling(None, why, "provisional", _seen("dataset", known))
         basis: Literal["final", "provisional"] = "final" if final else "provisional"
         seen = _seen("dataset", known)
         resolution = self.scorers_[self.rule_scorer].resolution
@@ -586,9 +591,8 @@ def _check_reference(episodes: Sequence[Episode]) -> None:
         seen.add(episode.id)
         seen_in = (*episode.findings, *gripper_findings(episode), *check_episode(episode))
         faults = untrustworthy(seen_in)
-        if len(episode) < 2:
-            refused.append(f"{episode.name} ({episode.id}): it has {len(episode)} steps")
-        elif faults:
+        if faults:
             refused.append(f"{episode.name} ({episode.id}): {faults[0].id}: {faults[0].message}")
     if refused:
-        raise EpisodeError(f"reference refused: {'; '.join(refused)}")
+        more = f"; and {len(refused) - _SHOWN} more" if len(refused) > _SHOWN else ""
+        raise EpisodeError(f"reference refused: {'; '.join(refused[:_SHOWN])}{more}")

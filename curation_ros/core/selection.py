@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from curation_ros.core.decisions import Decision
+from curation_ros.core.decisions import CURATOR, Decision
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.separation import split_scores
 from curation_ros.core.stream import Floats
@@ -20,7 +20,9 @@ from curation_ros.core.stream import Floats
 Span = tuple[int, int]
 TieKey = Callable[[str], str]
 
-#: Rule -> what `value` means to it. The only list; the command line is made from it.
+#: Rule -> what `value` means to it. The only list; the command line is made from it. All but
+#: `all` leave out what a person has discarded or wants reviewed; what the curator has decided
+#: counts for `decisions` alone.
 KEEP_RULES: dict[str, str] = {
     "decisions": "keep what was decided to keep, and the spans to salvage; no value",
     "top-fraction": "keep the best share of the scored episodes, value from 0 to 1",
@@ -45,6 +47,14 @@ class Candidate:
     name: str
     score: float | None = None
     decision: Decision | None = None
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether a person has discarded it, or keeps it for review: no score outranks that."""
+        decision = self.decision
+        if decision is None or decision.by == CURATOR:
+            return False
+        return decision.verdict in ("review", "discard")
 
 
 @dataclass(frozen=True)
@@ -147,6 +157,7 @@ def select(
         silent = tuple(c.episode for c in pool if c.decision is None)
         return Selection(entries, silent, len(pool))
     known = {c.episode: c for c in pool}
+    pool = [c for c in pool if not c.is_refused]
     scores = {c.episode: c.score for c in pool if c.score is not None}
     silent = tuple(c.episode for c in pool if c.score is None)
     order = ranking(scores, lambda i: ties(known[i]))
@@ -164,10 +175,10 @@ def select(
         n_kept = keep_count(rule, value, len(order))
         if n_kept > len(order):
             raise ConfigError(
-                f"top-k {n_kept}: only {len(order)} of {len(pool)} episodes have a score"
+                f"top-k {n_kept}: only {len(order)} of {len(known)} episodes have a score"
             )
     kept = tuple(Entry(i, known[i].name) for i in order[:n_kept])
-    return Selection(kept, silent, len(pool))
+    return Selection(kept, silent, len(known))
 
 
 def ranking(scores: Mapping[str, float], tie: Callable[[str], Any]) -> list[str]:

@@ -4,6 +4,7 @@ import functools
 import json
 import shutil
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -519,6 +520,14 @@ def test_repeated_decision_is_logged_once_and_its_evidence_is_added(dataset: Dat
     assert [d.revision for d in dataset.decisions(_good().id)] == [1, 2, 2]
 
 
+def test_decision_that_several_make_at_once_is_logged_once(dataset: Dataset) -> None:
+    decision = _fitted().decide(_good())
+    with ThreadPoolExecutor(8) as pool:
+        told = list(pool.map(lambda _: log_decision(dataset, decision), range(16)))
+    assert dataset.decisions(_good().id) == [decision]
+    assert told == [decision] * 16
+
+
 def test_evidence_added_after_a_person_decided_takes_nobodys_number(dataset: Dataset) -> None:
     decision = _fitted().decide(_good())
     log_decision(dataset, decision)
@@ -624,7 +633,7 @@ def test_rule_over_the_dataset_is_provisional_live_and_says_what_it_has_seen(
     live = _curator(dataset, _share())
     told = [_watch(live, e, samples_of(e))[0].decision for e in _episodes(6)]
     assert [d.verdict for d in told[:3]] == ["review"] * 3
-    assert told[2].reason == "the rule needs 4 scored episodes; so far there are 3"
+    assert told[2].reason == "the rule needs 4 scored episodes; there are 3"
     # Each is better than all before it, so each is among the best half when it comes.
     assert [d.verdict for d in told[3:]] == ["keep"] * 3
     assert [d.evidence["basis"] for d in told] == ["provisional"] * 6

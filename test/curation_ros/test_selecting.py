@@ -195,7 +195,10 @@ def test_empty_dataset_gives_no_selection(dataset: Dataset) -> None:
     ("options", "said"),
     [
         ({"rule": "top-k", "value": 1}, "ranks by a scorer"),
-        ({"rule": "top-k", "value": 1, "scorer": "nose"}, "no episode has a score of 'nose'"),
+        (
+            {"rule": "top-k", "value": 1, "scorer": "nose"},
+            "no episode has a logged score of 'nose'",
+        ),
         ({"rule": "top-k", "value": 4, "scorer": "knn"}, "only 3 of 3"),
         ({"rule": "top-k", "scorer": "knn"}, "'top-k' with value None"),
         ({"rule": "top-k", "value": 1.5, "scorer": "knn"}, "'top-k' with value 1.5"),

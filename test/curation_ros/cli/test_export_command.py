@@ -65,8 +65,11 @@ def test_csv_says_what_score_says(curation: Run, folder: Path, data: Path, tmp_p
     [
         ([], USAGE, "--out"),
         (["--out", "new", "--format", "nose"], USAGE, "nose"),
-        (["--out", "new", "--selection", "nose"], USAGE, "nose.json"),
-        (["--out", "taken"], NOTHING, "taken exists: --force overwrites it"),
+        (["--out", "new", "--format", "csv", "--selection", "nose"], USAGE, "nose.json"),
+        (["--out", "taken", "--format", "csv"], NOTHING, "taken exists: --force overwrites it"),
+        (["--out", "new.txt"], USAGE, "none of .json, .csv, .parquet: name a --format"),
+        (["--out", "new.csv", "--format", "parquet"], USAGE, "is not --format parquet"),
+        (["--out", "nowhere/new.csv"], USAGE, "there is no folder"),
     ],
 )
 def test_wrong_export_is_one_line_and_a_code(
@@ -98,10 +101,10 @@ def test_force_overwrites(curation: Run, data: Path, tmp_path: Path) -> None:
 def test_dataset_without_decisions_or_episodes_is_nothing(
     curation: Run, folder: Path, tmp_path: Path
 ) -> None:
-    told = curation("export", folder / "data", "--out", tmp_path / "x", "--json")
+    told = curation("export", folder / "data", "--out", tmp_path / "x.json", "--json")
     assert (told.code, told.out) == (NOTHING, "")
     assert "no decision yet" in told.err
     (tmp_path / "empty" / "episodes").mkdir(parents=True)
-    told = curation("export", tmp_path / "empty", "--out", tmp_path / "x", "--json")
+    told = curation("export", tmp_path / "empty", "--out", tmp_path / "x.csv", "--json")
     assert told.code == NOTHING
     assert "no episode to export" in told.err

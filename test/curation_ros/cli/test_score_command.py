@@ -358,3 +358,30 @@ def test_executable_prints_json_into_a_pipe_that_may_close(folder: Path) -> None
         code = process.wait()
     assert list(first) == KEYS
     assert (code, err) == (DONE, "")
+
+
+def test_bag_under_another_name_is_found_and_not_logged(curation: Run, folder: Path) -> None:
+    bag = _bag(folder)
+    bag.rename(bag.with_name("my favourite"))
+    told = curation("score", folder / "data", *_options(folder), "--write", "--json")
+    assert told.code == DONE
+    [row] = [r for r in told.rows if r["name"] == "pick-0"]
+    assert [f["id"] for f in row["findings"]] == ["wrong-id"]
+    assert row["decision"] == "review"
+    said = " ".join(told.err.split())
+    assert "my favourite: not logged: its folder is not named after its episode" in said
+    assert f"rename it to {bag.name}" in said
+    assert not Dataset(folder / "data").decision_log(bag.name).exists()
+
+
+def test_reference_among_what_is_scored_is_told(curation: Run, folder: Path) -> None:
+    options = ["--reference", folder / "reference", "--config", folder / "curation.yaml"]
+    told = curation("score", folder / "reference", *options)
+    assert "5 of the 5 episodes are in the reference" in " ".join(told.err.split())
+    told = curation("score", folder / "data", *options)
+    assert "in the reference" not in told.err
+
+
+def test_summary_counts_verdicts(curation: Run, folder: Path) -> None:
+    told = curation("score", folder / "data", *_options(folder))
+    assert "2 keep, 1 review, 2 discard; scored 5" in " ".join(told.err.split())

@@ -132,7 +132,7 @@ def test_rules_say_what_they_need_and_describe_themselves(name: str) -> None:
     if rule.needs == "dataset":
         with pytest.raises(NotFittedError):
             rule.judge({"s": 1.0}, {}, {}, "e")
-        with pytest.raises(EpisodeError, match="scored episodes; so far there are 2"):
+        with pytest.raises(EpisodeError, match="scored episodes; there are 2"):
             rule.fit_dataset({"a": 1.0, "b": 2.0})
 
 

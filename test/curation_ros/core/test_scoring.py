@@ -234,8 +234,26 @@ def test_reference_with_faults_is_refused_by_name(
     assert "good-" not in str(caught.value)
     with pytest.raises(EpisodeError, match="there twice"):
         Curation().fit([*reference, reference[0]])
-    with pytest.raises(EpisodeError, match="it has 1 steps"):
+    with pytest.raises(EpisodeError, match="too-short: 1 steps"):
         Curation().fit([*reference, make_episode(rng, 1)])
+
+
+def test_mistake_of_all_references_is_said_once_and_not_fifty_times(
+    rng: np.random.Generator,
+) -> None:
+    gap = Finding("gap", "silent", (0, 9))
+    with pytest.raises(EpisodeError) as caught:
+        Curation().fit([make_episode(rng, name=f"bad-{k}", findings=[gap]) for k in range(9)])
+    assert str(caught.value).count("gap: silent") == 3
+    assert str(caught.value).endswith("; and 6 more")
+
+
+def test_rule_over_the_dataset_says_why_its_scorer_is_silent(rng: np.random.Generator) -> None:
+    curation = Curation(rule="gap", rule_scorer="knn").fit([])
+    ruling = curation.ruling({"a": None, "b": None}, final=True)
+    assert ruling.no_rule == "knn cannot tell: no reference"
+    decision = curation.judge(curation.examine(make_episode(rng)), ruling)
+    assert (decision.verdict, decision.reason) == ("review", "knn cannot tell: no reference")
 
 
 def test_reference_that_the_deciding_scorer_cannot_score_is_refused_by_name(

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from curation_ros.core.decisions import Decision, Verdict
+from curation_ros.core.decisions import CURATOR, Decision, Verdict
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.selection import (
     KEEP_RULES,
@@ -143,6 +143,24 @@ def test_tie_key_of_start_and_repetition_decides_before_the_id() -> None:
     # The same starts under other ids come out in the same order.
     starts = {f"id-{k}": (k * 3) % 5 for k in range(5)}
     assert [starts[e.episode] for e in select(pool(*[0.0] * 5), "all", tie=tie).entries] == first
+
+
+def test_no_score_outranks_a_person() -> None:
+    def by(who: str, verdict: str) -> Decision:
+        return Decision("x", "", verdict, "r", (0, 9), by=who)  # type: ignore[arg-type]
+
+    pool = [
+        Candidate("a", "", 9.0, by("ada", "discard")),
+        Candidate("b", "", 8.0, by("ada", "review")),
+        Candidate("c", "", 7.0, by(CURATOR, "discard")),
+        Candidate("d", "", 6.0, by("ada", "keep")),
+        Candidate("e", "", 5.0),
+    ]
+    for rule, value in (("top-k", 2), ("top-fraction", 0.67), ("threshold", 5.5)):
+        chosen = select(pool, rule, value)
+        assert [e.episode for e in chosen.entries] == ["c", "d"], rule
+        assert chosen.kept_of == 5
+    assert len(select(pool, "all").entries) == 5
 
 
 def test_equal_tie_keys_do_not_fall_back_to_the_order_given() -> None:

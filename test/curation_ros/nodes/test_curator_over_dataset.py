@@ -51,7 +51,7 @@ def test_live_decisions_are_provisional_and_name_what_they_have_seen(graph, data
     assert {d.evidence["basis"] for d in first} == {"provisional"}
     assert [d.evidence["fitted_on"]["episodes"] for d in first] == [1, 2, 3, 4, 5, 6]
     reasons = [d.reason for d in first]
-    assert reasons[0] == "the rule needs 4 scored episodes; so far there are 1"
+    assert reasons[0] == "the rule needs 4 scored episodes; there are 1"
     assert reasons[5] == "length -40.00 is among the best 3 of 6"
     assert [d.verdict for d in first] == ["review"] * 3 + ["keep"] * 3
     assert graph.decided(takes[5].id).message == "keep"
