@@ -86,8 +86,8 @@ class TornFileError(BagError):
 
     def __init__(self, path: Path, reason: str, finding: str = "malformed") -> None:
         super().__init__(
-            f"{path} is truncated or damaged: {reason}; `ros2 run curation_ros recorder` recovers "
-            "what an interrupted recording has left, curation_ros.bags.recover_bag any file",
+            f"{path} is truncated or damaged: {reason}; `curation recover` saves what it "
+            "still holds; what an interrupted recording has left, the next recorder does",
             finding=finding,
         )
         self.path = path

@@ -21,6 +21,7 @@ COMMANDS = {
     "override": ("curation_ros.cli.override", "a person's decision on an episode"),
     "index": ("curation_ros.cli.index", "list a dataset; rebuild its index from its files"),
     "self-check": ("curation_ros.cli.self_check", "prove that no score depends on labels"),
+    "recover": ("curation_ros.cli.recover", "save what a damaged bag still holds"),
     "record": ("curation_ros.cli.record", "start and stop a recorder that is driven by hand"),
     "collect": ("curation_ros.cli.collect", "record simulated demonstrations, without ROS"),
     "train": ("curation_ros.cli.train", "train a policy on a selection"),
