@@ -149,7 +149,9 @@ def test_budget_is_kept_and_what_is_missing_is_named(
     tight = judge(study.folder, jobs=jobs, budget_steps=5 * MAX_STEPS + 1)
     asked = rollouts(units)
     work = tight.roll(asked)
-    assert [(row["policy"], row["start"]) for row in work.done] == [u.key for u in asked[:5]]
+    # In whatever order the workers end: the first five of what was asked.
+    done = sorted((row["policy"], row["start"]) for row in work.done)
+    assert done == sorted(u.key for u in asked[:5])
     assert len(work.missing) == 7
     assert work.missing[0] == (
         f"rollout of {asked[5].policy} from {asked[5].start}: 30 of 31 steps are used, "
