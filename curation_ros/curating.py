@@ -231,7 +231,10 @@ class LiveCuration:
             return []
         if self.running:
             raise EpisodeError("an episode is running: decide on the whole dataset after it")
-        return decide_dataset(self.dataset, self.curation, self.topic_map)
+        decided = decide_dataset(self.dataset, self.curation, self.topic_map)
+        # Scorers may have learned from the dataset anew: their scores of before count no more.
+        self._scores = _known_scores(self.dataset, self.curation)
+        return decided
 
     def override(self, prefix: str, verdict: str, reason: str, by: str) -> Decision:
         """Log a person's decision.

@@ -672,6 +672,21 @@ def test_final_decisions_are_over_the_whole_dataset_whatever_came_first(dataset:
     assert {e.episode for e in manifest.entries} == {e.id for e in episodes[3:]}
 
 
+def test_after_a_final_decision_the_next_episode_is_one_more(dataset: Dataset) -> None:
+    options: dict[str, Any] = {"rule": "top-fraction", "rule_scorer": "knn_label_free"}
+    live = _curator(dataset, Curation(scorers=("knn_label_free", "length"), **options).fit([]))
+    *episodes, last = _episodes(7)
+    for episode in episodes:
+        [decided] = _watch(live, episode, samples_of(episode))
+        assert "compares with the whole dataset" in decided.decision.reason
+        record(dataset, episode)
+        live.bag_closed(episode.id)
+    live.finish()
+    [decided] = _watch(live, last, samples_of(last))
+    assert decided.decision.evidence["fitted_on"]["episodes"] == 7
+    assert decided.decision.evidence["basis"] == "provisional"
+
+
 def test_curator_that_starts_again_leaves_a_final_decision_as_it_is(dataset: Dataset) -> None:
     live = _curator(dataset, _share())
     episodes = _episodes(6)
