@@ -128,6 +128,11 @@ def test_graph_and_one_process_go_the_same_way(graph, answers, folder, request):
     answers.robot.node.destroy_node()
     graph.events.clear()
     graph.start("recorder", dataset=dataset)
+    # Recorder and policy discover each other while the simulator starts, not after: the sim waits
+    # for both, but cannot see whether each of them sees the other.
+    graph.ready("recorder")
+    for topic in COMMANDS:
+        graph.until(lambda t=topic: graph.node.count_subscribers(t), f"the recorder hears {topic}")
     graph.start(
         "sim_node",
         mode="command",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from contextlib import suppress
 
 import pytest
 from mcap_ros2.reader import read_ros2_messages
@@ -171,8 +172,14 @@ def test_known_id_is_refused(graph, robot, sessions):
     before = {path.name: path.read_bytes() for path in bag.iterdir()}
     graph.start("recorder", "refusing", dataset=sessions.dataset("int"))
     graph.ready("refusing")
-    graph.quiet(1.0)  # the killed ones are still counted as subscribers
-    robot.play(sessions.take)
-    graph.ready("refusing", line="the dataset already has this episode")
+    # The killed ones are still counted as subscribers, so nothing tells when this one is matched:
+    # the owner plays until it is.
+    said = "the dataset already has this episode"
+    for _ in range(5):
+        robot.play(sessions.take)
+        with suppress(AssertionError):
+            graph.until(lambda: said in graph.log("refusing"), said, timeout_s=3.0)
+            break
+    graph.ready("refusing", line=said)
     graph.stop("refusing", *TOGETHER)
     assert {path.name: path.read_bytes() for path in bag.iterdir()} == before
