@@ -165,6 +165,8 @@ class LiveCuration:
         if self.curation.rule_looks_at_dataset:
             if self.curation.is_trusted(seen):
                 self._scores[seen.episode] = seen.scores.get(self.curation.rule_scorer)
+            else:  # its bag may show a fault that was not seen live
+                self._scores.pop(seen.episode, None)
             ruling = self.curation.ruling(self._scores, final=False, tie=self.dataset.tie(0))
         return self.curation.judge(seen, ruling)
 

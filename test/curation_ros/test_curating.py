@@ -672,6 +672,18 @@ def test_final_decisions_are_over_the_whole_dataset_whatever_came_first(dataset:
     assert {e.episode for e in manifest.entries} == {e.id for e in episodes[3:]}
 
 
+def test_episode_whose_bag_has_a_fault_counts_no_more(dataset: Dataset) -> None:
+    live = _curator(dataset, _share())
+    first, *rest = _episodes(6)
+    samples = samples_of(first)
+    [decided] = _watch(live, first, samples)
+    assert decided.decision.evidence["fitted_on"]["episodes"] == 1
+    record(dataset, first, samples=[s for s in samples if not 50 < s.seq < 90])
+    assert _told(live.bag_closed(first.id)).evidence["fitted_on"]["episodes"] == 0
+    [decided] = _watch(live, rest[0], samples_of(rest[0]))
+    assert decided.decision.evidence["fitted_on"]["episodes"] == 1
+
+
 def test_after_a_final_decision_the_next_episode_is_one_more(dataset: Dataset) -> None:
     options: dict[str, Any] = {"rule": "top-fraction", "rule_scorer": "knn_label_free"}
     live = _curator(dataset, Curation(scorers=("knn_label_free", "length"), **options).fit([]))
