@@ -160,7 +160,8 @@ def test_stopped_in_mid_episode_the_owner_says_so(graph, dataset, stream):
     assert event.end_ns == stream.last_ns
     decision = graph.settled(dataset, started["episode"])
     assert (decision.verdict, decision.evidence["bag"]) == ("review", "equal")
-    assert {f.id for f in decision.findings if f.kind == "recording"} >= {"aborted"}
+    # It was not open at its beginning, and it did not get to its end.
+    assert {f.id for f in decision.findings} == {"aborted", "clipped-start", "unfinished"}
     assert decision.reason.startswith("aborted: the recorder was stopped")
     assert len(read_episode(dataset / "episodes" / started["episode"])) == 15
 
