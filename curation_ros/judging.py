@@ -142,6 +142,8 @@ class Judge:
     Attributes:
         folder: of the study.
         max_steps: most commands of a rollout.
+        gives_up: whether rollouts that are as good as lost are ended, see
+            `policy_node.rollouts.GiveUp`.
         budget_steps: simulation steps that all rollouts together may take, earlier runs included.
             Steps are commands executed; the ten settling steps of a reset are none.
     """
@@ -153,6 +155,7 @@ class Judge:
         jobs: int = 1,
         backend: str = "loky",
         max_steps: int = MAX_STEPS,
+        gives_up: bool = False,
         budget_steps: int = BUDGET_STEPS,
     ) -> None:
         """Open a study, or begin one; its limits are declared in the log before anything runs.
@@ -162,6 +165,7 @@ class Judge:
             jobs: workers; 1 works in this process, -1 takes all cores.
             backend: of the workers, see `curation_ros.workers`.
             max_steps: most commands of a rollout; the same for the whole study.
+            gives_up: whether lost rollouts are ended; the same for the whole study.
             budget_steps: another number than before is declared anew, and stays on record.
 
         Raises:
@@ -175,16 +179,18 @@ class Judge:
                 "least 1 and 0"
             )
         self.folder, self.max_steps, self.budget_steps = Path(folder), max_steps, budget_steps
+        self.gives_up = gives_up
         self._jobs, self._backend = jobs, backend
         self._log = self.folder / "units.jsonl"
         declared = [row for row in read_lines(self._log) if row.get("kind") == "declaration"]
-        if declared and declared[-1]["max_steps"] != max_steps:
-            raise ConfigError(
-                f"{self._log}: rollouts of this study have max_steps "
-                f"{declared[-1]['max_steps']}, not {max_steps}"
-            )
+        limits = {"max_steps": max_steps, "gives_up": gives_up, "budget_steps": budget_steps}
+        for key in ("max_steps", "gives_up") if declared else ():
+            if declared[-1].get(key, False) != limits[key]:
+                raise ConfigError(
+                    f"{self._log}: rollouts of this study have {key} "
+                    f"{declared[-1].get(key, False)}, not {limits[key]}"
+                )
         if not declared or declared[-1]["budget_steps"] != budget_steps:
-            limits = {"max_steps": max_steps, "budget_steps": budget_steps}
             self._append({"kind": "declaration", **limits})
 
     def rows(self, kind: str) -> list[Row]:
@@ -263,7 +269,8 @@ class Judge:
                 now, todo = todo[:n], todo[n:]
                 groups = groupby(now, key=lambda unit: unit.policy)
                 tasks = [part for _, group in groups for part in _parts(list(group), _ROLLOUTS)]
-                fresh = self._run(_roll, tasks, {"max_steps": self.max_steps}, progress)
+                settings = {"max_steps": self.max_steps, "gives_up": self.gives_up}
+                fresh = self._run(_roll, tasks, settings, progress)
                 rows += fresh
                 used += sum(int(row["steps"]) for row in fresh)
             missing += [
@@ -420,7 +427,7 @@ def _numbered(
     return k, function(folder, units, **settings)
 
 
-def _roll(folder: Path, units: Sequence[RolloutUnit], max_steps: int) -> list[Row]:
+def _roll(folder: Path, units: Sequence[RolloutUnit], max_steps: int, gives_up: bool) -> list[Row]:
     """Rollouts of one policy."""
     rows = []
     for unit in units:
@@ -429,16 +436,16 @@ def _roll(folder: Path, units: Sequence[RolloutUnit], max_steps: int) -> list[Ro
             policy = Policy.load(folder / "policies" / unit.policy)
             start = start_by_name(start_name(unit.start))
             try:
-                made = rollout(process_env(), start, policy, max_steps)
+                made = rollout(process_env(), start, policy, max_steps, gives_up=gives_up)
             except CurationError:
                 steps = max(0, process_env().n_steps)
                 raise
         except CurationError as err:
-            ended = {"success": False, "steps": steps, "stage": ""}
+            ended = {"success": False, "steps": steps, "stage": "", "ended": ""}
             rows.append(unit.row(**ended, status="failed", reason=str(err)))
         else:
-            ended = {"success": made.success, "steps": made.steps, "stage": made.stage}
-            rows.append(unit.row(**ended, status="ok", reason=""))
+            how = {key: getattr(made, key) for key in ("success", "steps", "stage", "ended")}
+            rows.append(unit.row(**how, status="ok", reason=""))
     return rows
 
 
@@ -503,7 +510,7 @@ def _adopted(folder: Path, unit: PolicyUnit) -> Row | None:
 def _died(unit: PolicyUnit | RolloutUnit, settings: Row) -> Row:
     if isinstance(unit, PolicyUnit):
         return unit.row(status="failed", reason=_DIED)
-    ended = {"success": False, "steps": settings["max_steps"], "stage": ""}
+    ended = {"success": False, "steps": settings["max_steps"], "stage": "", "ended": ""}
     return unit.row(**ended, status="failed", reason=_DIED)
 
 

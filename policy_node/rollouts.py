@@ -6,11 +6,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
+from curation_ros.core.phases import PHASES
 from curation_ros.core.stream import Floats
 from policy_node.controller import PolicyController
 from policy_node.policy import Policy
 from sim_node.env import BOWL, PLATE, LiberoEnv, Observation
-from sim_node.episodes import MAX_STEPS, run_episode
+from sim_node.episodes import MAX_STEPS, Step, run_episode
 from sim_node.starts import Start
 
 
@@ -25,6 +28,7 @@ class Rollout:
         steps: commands executed.
         stage: the last phase reached. Phases do not watch the object: a policy that has lost it
             goes on to RELEASE, as a defective demonstration does.
+        ended: `success`, `max_steps`, or what `GiveUp` says.
     """
 
     policy: str
@@ -32,10 +36,11 @@ class Rollout:
     success: bool
     steps: int
     stage: str
+    ended: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data, as `curation evaluate` prints it."""
-        return asdict(self)
+        """Plain data, as `curation evaluate` prints it, which never gives up."""
+        return {key: value for key, value in asdict(self).items() if key != "ended"}
 
 
 def field_values(observation: Observation) -> dict[str, Floats]:
@@ -60,7 +65,63 @@ class _SimController:
         return self._controller.act(field_values(observation), phase_index)
 
 
-def rollout(env: LiberoEnv, start: Start, policy: Policy, max_steps: int = MAX_STEPS) -> Rollout:
+class GiveUp:
+    """Ends a rollout that is as good as lost: a study's steps go where they tell something.
+
+    `lost`: the object lies on the table, at rest, out of reach of the gripper and off the goal, in
+    a phase from which the phases never lead back to a grasp. `phase`: the policy has been in one
+    phase for more than twice as long as any demonstration; a success after that counts as a
+    failure, as one after `max_steps` does. `benchmarks/giving_up.py` counts how often either rule
+    is wrong. For one rollout.
+    """
+
+    #: Steps in one phase; demonstrations take up to 70 in one, and succeed 4 steps into RELEASE.
+    PHASE_STEPS, RELEASE_STEPS = 200, 60
+    _REST_STEPS, _REST_M = 20, 1e-3
+    _ON_TABLE_M, _OUT_OF_REACH_M, _OFF_GOAL_M = 0.02, 0.12, 0.06
+
+    def __init__(self) -> None:
+        self._height_m = 0.0
+        self._phase = -1
+        self._phase_steps = 0
+        self._lying: list[Floats] = []
+
+    def __call__(self, step: Step) -> str:
+        """Why to end before this step; empty: go on."""
+        if step.index == 0:
+            self._height_m = float(step.observation.objects[BOWL][0][2])
+        self._phase_steps = self._phase_steps + 1 if step.phase_index == self._phase else 1
+        self._phase = step.phase_index
+        is_last = self._phase == len(PHASES) - 1
+        if self._phase_steps > (self.RELEASE_STEPS if is_last else self.PHASE_STEPS):
+            return "phase"
+        return "lost" if self._is_lost(step) else ""
+
+    def _is_lost(self, step: Step) -> bool:
+        bowl, plate = (step.observation.objects[name][0] for name in (BOWL, PLATE))
+        if not (
+            self._phase >= PHASES.index("LIFT")
+            and bowl[2] < self._height_m + self._ON_TABLE_M
+            and np.linalg.norm(bowl - step.observation.eef_position_m) > self._OUT_OF_REACH_M
+            and np.linalg.norm(bowl[:2] - plate[:2]) > self._OFF_GOAL_M
+        ):
+            self._lying.clear()
+            return False
+        self._lying.append(bowl)
+        recent = self._lying[-self._REST_STEPS :]
+        return len(recent) == self._REST_STEPS and bool(
+            np.ptp(recent, axis=0).max() < self._REST_M
+        )
+
+
+def rollout(
+    env: LiberoEnv,
+    start: Start,
+    policy: Policy,
+    max_steps: int = MAX_STEPS,
+    *,
+    gives_up: bool = False,
+) -> Rollout:
     """Let a policy act from one start until it succeeds or the steps are used up.
 
     Args:
@@ -68,6 +129,7 @@ def rollout(env: LiberoEnv, start: Start, policy: Policy, max_steps: int = MAX_S
         start: where to start.
         policy: what acts.
         max_steps: most commands.
+        gives_up: whether a rollout that is as good as lost is ended, see `GiveUp`.
 
     Raises:
         ConfigError: if max_steps is not positive.
@@ -75,9 +137,15 @@ def rollout(env: LiberoEnv, start: Start, policy: Policy, max_steps: int = MAX_S
         SimError: if the simulation diverged.
     """
     result = run_episode(
-        env, start, _SimController(policy), max_steps=max_steps, steps_after_success=0
+        env,
+        start,
+        _SimController(policy),
+        max_steps=max_steps,
+        steps_after_success=0,
+        give_up=GiveUp() if gives_up else None,
     )
-    return Rollout(policy.id, start.name, result.is_success, result.n_steps, result.stage)
+    ended = "success" if result.is_success else result.given_up or "max_steps"
+    return Rollout(policy.id, start.name, result.is_success, result.n_steps, result.stage, ended)
 
 
 def evaluate(

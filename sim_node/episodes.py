@@ -56,6 +56,7 @@ class EpisodeResult:
         success_step: index of the command after which the goal held for the first time.
         stage: name of the phase that was reached.
         phase_steps: steps in each phase.
+        given_up: why it was ended before its time; empty where it was not.
     """
 
     start: str
@@ -65,6 +66,7 @@ class EpisodeResult:
     success_step: int | None
     stage: str
     phase_steps: tuple[int, ...]
+    given_up: str = ""
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,7 @@ def run_episode(
     max_steps: int = MAX_STEPS,
     steps_after_success: int = STEPS_AFTER_SUCCESS,
     on_step: Callable[[Step], None] | None = None,
+    give_up: Callable[[Step], str] | None = None,
 ) -> EpisodeResult:
     """Reset, then observe, track the phase, ask for a command and execute it, until the end.
 
@@ -110,6 +113,7 @@ def run_episode(
         max_steps: most commands.
         steps_after_success: commands after the one that succeeded; 0 for evaluating policies.
         on_step: called before each command is executed.
+        give_up: called before each command that is executed; a reason ends the episode instead.
 
     Raises:
         ConfigError: if max_steps is not positive or steps_after_success is negative.
@@ -125,12 +129,16 @@ def run_episode(
     phase_steps = [0] * len(PHASES)
     success_step: int | None = None
     is_success = False
+    given_up = ""
     n_steps = 0
     while n_steps < max_steps:
         phase_index = tracker.update(observation)
         action_xyz, gripper = controller.act(observation, phase_index)
+        step = Step(n_steps, observation, phase_index, tracker.progress, action_xyz, gripper)
+        if give_up is not None and success_step is None and (given_up := give_up(step)):
+            break
         if on_step is not None:
-            on_step(Step(n_steps, observation, phase_index, tracker.progress, action_xyz, gripper))
+            on_step(step)
         observation = env.step(action_xyz, gripper)
         phase_steps[phase_index] += 1
         n_steps += 1
@@ -147,6 +155,7 @@ def run_episode(
         success_step=success_step,
         stage=tracker.name,
         phase_steps=tuple(phase_steps),
+        given_up=given_up,
     )
 
 

@@ -97,7 +97,7 @@ def test_rows_say_what_was_done(study: Judge, units: list[PolicyUnit]) -> None:
     assert Policy.load(study.policy_folder(first["policy"])).card.seed == 0
     row = study.rows("rollout")[0]
     assert set(row) == {
-        *("kind", "policy", "start", "success", "steps", "stage", "status", "reason")
+        *("kind", "policy", "start", "success", "steps", "stage", "ended", "status", "reason")
     }
     assert (row["policy"], row["start"]) == ("all-relative-s0", STARTS[0])
     assert (row["success"], row["steps"], row["status"]) == (False, MAX_STEPS, "ok")

@@ -67,3 +67,36 @@ def test_success_ends_the_rollout(env, start, monkeypatch):
     monkeypatch.setattr(env, "is_success", lambda: True)
     done = rollout(env, start, policy(), MAX_STEPS)
     assert (done.success, done.steps) == (True, 1)
+
+
+@pytest.mark.parametrize(("defect", "why"), [("none", ""), ("early_release", "lost")])
+def test_a_dropped_bowl_is_given_up_and_a_carried_one_is_not(env, start, defect, why):
+    from policy_node.rollouts import GiveUp
+    from sim_node.defects import DEFECTS
+    from sim_node.episodes import run_episode
+    from sim_node.expert import Expert
+
+    def run(give_up):
+        controller = DEFECTS[defect].inject(Expert(0), 0)
+        return run_episode(env, start, controller, steps_after_success=0, give_up=give_up)
+
+    ended, whole = run(GiveUp()), run(None)
+    assert ended.given_up == why
+    assert ended.is_success == whole.is_success == (defect == "none")
+    assert (ended.n_steps == whole.n_steps) == (defect == "none")
+    assert ended.n_steps < 300
+
+
+def test_a_policy_that_goes_nowhere_is_given_up(env, start):
+    from policy_node.rollouts import GiveUp, rollout
+
+    class Idle:
+        spec = policy().spec
+        id = "idle"
+
+        def act(self, observation):
+            return np.zeros(3), -1.0
+
+    ended = rollout(env, start, Idle(), gives_up=True)
+    assert (ended.success, ended.ended, ended.steps) == (False, "phase", GiveUp.PHASE_STEPS)
+    assert ended.stage == PHASES[0]
