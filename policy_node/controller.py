@@ -45,11 +45,11 @@ class PolicyController:
                 no such phase. A first step that raises is not remembered.
         """
         spec = self.policy.spec
-        missing = [name for name in spec.fields if name not in values and name != PHASE]
-        if missing:
-            raise PolicyError(
-                f"observation: no field {missing[0]!r}; it has {', '.join(values) or 'none'}"
-            )
+        for name in spec.fields:
+            if name not in values and name != PHASE:
+                raise PolicyError(
+                    f"observation: no field {name!r}; it has {', '.join(values) or 'none'}"
+                )
         start = self._start
         if start is None:
             # Copies: the caller may fill the same arrays anew in the next step.

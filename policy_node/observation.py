@@ -16,6 +16,7 @@ from curation_ros.core.stream import Floats
 from curation_ros.core.topic_map import AT_START, TopicMap
 
 Span = tuple[int, int]
+Operands = tuple[tuple[str, bool], ...]
 
 PHASE = "phase"
 _MINUS = " - "
@@ -114,15 +115,27 @@ class ObservationSpec:
         """(S, D) change of each column by each value of `start_fields`, in their order."""
         rows = {name: 3 * k for k, name in enumerate(self.start_fields)}
         effect = np.zeros((3 * len(rows), self.width))
+        for operands, place in self._layout:
+            for sign, (name, at_start) in zip((1.0, -1.0), operands, strict=False):
+                if at_start:
+                    effect[rows[name] : rows[name] + 3, place] = sign * np.eye(3)
+        return effect
+
+    @cached_property
+    def _layout(self) -> tuple[tuple[Operands, slice], ...]:
+        """Operands of each term, and the columns that it fills."""
+        places: list[tuple[Operands, slice]] = []
         first = 0
         for term in self.terms:
             operands = _operands(term)
             width = len(self.phase_labels) if term == PHASE else _WIDTHS[operands[0][0]]
-            for sign, (name, at_start) in zip((1.0, -1.0), operands, strict=False):
-                if at_start:
-                    effect[rows[name] : rows[name] + 3, first : first + 3] = sign * np.eye(3)
+            places.append((operands, slice(first, first + width)))
             first += width
-        return effect
+        return tuple(places)
+
+    @cached_property
+    def _phase_indices(self) -> npt.NDArray[np.int_]:
+        return np.arange(len(self.phase_labels))
 
     def check(self, topic_map: TopicMap, where: str) -> None:
         """Refuse a topic map that cannot give these observations.
@@ -213,25 +226,21 @@ class ObservationSpec:
         self, values: Mapping[str, Floats], start: Mapping[str, Floats], n_steps: int, where: str
     ) -> Floats:
         out = np.empty((n_steps, self.width))
-        k = 0
-        for term in self.terms:
-            if term == PHASE:
-                labels = np.arange(len(self.phase_labels))
-                stop = k + len(labels)
-                out[:, k:stop] = values[PHASE] == labels
-                unknown = np.flatnonzero(~out[:, k:stop].any(axis=1))
-                if len(unknown):
+        for operands, place in self._layout:
+            name, at_start = operands[0]
+            if name == PHASE:
+                out[:, place] = is_phase = values[PHASE] == self._phase_indices
+                if not is_phase.any(axis=1).all():
+                    row = int(np.argmin(is_phase.any(axis=1)))
                     raise PolicyError(
-                        f"{where}: phase index {values[PHASE][unknown[0], 0]} in row "
-                        f"{unknown[0]}, expected 0 to {len(labels) - 1}"
+                        f"{where}: phase index {values[PHASE][row, 0]} in row {row}, "
+                        f"expected 0 to {len(self.phase_labels) - 1}"
                     )
-            else:
-                parts = [
-                    start[name] if at_start else values[name] for name, at_start in _operands(term)
-                ]
-                stop = k + parts[0].shape[-1]
-                out[:, k:stop] = parts[0] if len(parts) == 1 else parts[0] - parts[1]
-            k = stop
+                continue
+            term = (start if at_start else values)[name]
+            for other, at_start in operands[1:]:
+                term = term - (start if at_start else values)[other]
+            out[:, place] = term
         if not np.isfinite(out).all():
             row, column = np.argwhere(~np.isfinite(out))[0]
             raise PolicyError(
@@ -241,9 +250,9 @@ class ObservationSpec:
         return out
 
 
-def _operands(term: str) -> list[tuple[str, bool]]:
+def _operands(term: str) -> Operands:
     """Fields of a term, and whether their values at the start are meant."""
-    return [(x.removesuffix(AT_START), x.endswith(AT_START)) for x in term.split(_MINUS)]
+    return tuple((x.removesuffix(AT_START), x.endswith(AT_START)) for x in term.split(_MINUS))
 
 
 def _row(name: str, values: Mapping[str, npt.ArrayLike], where: str) -> Floats:

@@ -37,11 +37,12 @@ BOWL = "akita_black_bowl_1"
 PLATE = "plate_1"
 
 _DIVERGED = {
-    mujoco.mjtWarning.mjWARN_BADQPOS: "position",
-    mujoco.mjtWarning.mjWARN_BADQVEL: "velocity",
-    mujoco.mjtWarning.mjWARN_BADQACC: "acceleration",
-    mujoco.mjtWarning.mjWARN_BADCTRL: "torque",
+    int(mujoco.mjtWarning.mjWARN_BADQPOS): "position",
+    int(mujoco.mjtWarning.mjWARN_BADQVEL): "velocity",
+    int(mujoco.mjtWarning.mjWARN_BADQACC): "acceleration",
+    int(mujoco.mjtWarning.mjWARN_BADCTRL): "torque",
 }
+_XYZW_OF_WXYZ = np.array([1, 2, 3, 0])
 
 
 @dataclass(frozen=True)
@@ -148,8 +149,12 @@ class LiberoEnv:
         self.joint_names = (*facts.arm_joints, *facts.finger_joints)
         self.object_names = tuple(facts.object_names)
         self.language = facts.language
-        self._site_id = model.site(facts.grip_site).id
-        self._body_ids = [model.body(name).id for name in facts.object_bodies]
+        site_id = model.site(facts.grip_site).id
+        # Views stay valid as long as the data lives, which this object holds.
+        self._site_position, self._site_rotation = data.site_xpos[site_id], data.site_xmat[site_id]
+        self._warning_counts = data.warning.number
+        self._body_ids = np.array([model.body(name).id for name in facts.object_bodies])
+        self._quat_places = 4 * self._body_ids[:, None] + _XYZW_OF_WXYZ
         self._n_steps = 0
         self.reset_s = 0.0
         self.construct_s = time.perf_counter() - started_s
@@ -217,28 +222,34 @@ class LiberoEnv:
         action = np.array(action_xyz, dtype=np.float64)
         if action.shape != (3,) or not (np.isfinite(action).all() and np.isfinite(gripper)):
             raise SimError(f"an action is 3 finite numbers and a gripper command, got {action}")
-        self._advance(np.clip(action, -1.0, 1.0), float(np.sign(gripper)))
+        clipped = np.minimum(np.maximum(action, -1.0), 1.0)
+        self._advance(clipped, float(np.sign(gripper)))
         return self.observe()
 
     def observe(self) -> Observation:
         """The observation of the present instant."""
         data = self._data
         quat_wxyz = np.empty(4)
-        mujoco.mju_mat2Quat(quat_wxyz, data.site_xmat[self._site_id])
-        position, velocity, effort = data.qpos, data.qvel, data.qfrc_actuator
+        mujoco.mju_mat2Quat(quat_wxyz, self._site_rotation)
+        # One copy of all joints; arm and fingers are parts of it.
+        position, velocity = data.qpos[:9].copy(), data.qvel[:9].copy()
+        effort = data.qfrc_actuator[:9].copy()
+        poses = zip(
+            self.object_names,
+            data.xpos.take(self._body_ids, axis=0),
+            data.xquat.take(self._quat_places),
+            strict=True,
+        )
         return Observation(
-            eef_position_m=data.site_xpos[self._site_id].copy(),
-            eef_quat_xyzw=np.roll(quat_wxyz, -1),
-            joint_position_rad=position[:7].copy(),
-            joint_velocity_rad_s=velocity[:7].copy(),
-            joint_effort_nm=effort[:7].copy(),
-            finger_position_m=position[7:9].copy(),
-            finger_velocity_m_s=velocity[7:9].copy(),
-            finger_effort_n=effort[7:9].copy(),
-            objects={
-                name: (data.xpos[body].copy(), np.roll(data.xquat[body], -1))
-                for name, body in zip(self.object_names, self._body_ids, strict=True)
-            },
+            eef_position_m=self._site_position.copy(),
+            eef_quat_xyzw=quat_wxyz[_XYZW_OF_WXYZ],
+            joint_position_rad=position[:7],
+            joint_velocity_rad_s=velocity[:7],
+            joint_effort_nm=effort[:7],
+            finger_position_m=position[7:],
+            finger_velocity_m_s=velocity[7:],
+            finger_effort_n=effort[7:],
+            objects={name: (at_m, quat_xyzw) for name, at_m, quat_xyzw in poses},
         )
 
     def is_success(self) -> bool:
@@ -274,9 +285,9 @@ class LiberoEnv:
 
     def _divergence(self) -> str | None:
         # MuJoCo counts a warning and resets the state by itself, so the state alone tells nothing.
-        counts = self._data.warning.number
+        counts = self._warning_counts
         for warning, name in _DIVERGED.items():
-            if counts[int(warning)]:
+            if counts[warning]:
                 return f"bad {name}"
         if not (np.isfinite(self._data.qpos).all() and np.isfinite(self._data.qvel).all()):
             return "state is not finite"
@@ -332,8 +343,8 @@ class _LeanStepper:
             _OnGoal(
                 upper_body=model.body(facts.object_bodies[facts.object_names.index(upper)]).id,
                 lower_body=model.body(facts.object_bodies[facts.object_names.index(lower)]).id,
-                upper_geoms=[model.geom(name).id for name in facts.contact_geoms[upper]],
-                lower_geoms=[model.geom(name).id for name in facts.contact_geoms[lower]],
+                is_upper=_geom_mask(model, facts.contact_geoms[upper]),
+                is_lower=_geom_mask(model, facts.contact_geoms[lower]),
             )
             for upper, lower in facts.goal_pairs
         ]
@@ -366,12 +377,12 @@ class _LeanStepper:
 
 @dataclass(frozen=True)
 class _OnGoal:
-    """LIBERO's predicate 'on', for two movable objects."""
+    """LIBERO's predicate 'on', for two movable objects; masks are over the model's geoms."""
 
     upper_body: int
     lower_body: int
-    upper_geoms: list[int]
-    lower_geoms: list[int]
+    is_upper: NDArray[np.bool_]
+    is_lower: NDArray[np.bool_]
 
     def holds(self, model: mujoco.MjModel, data: mujoco.MjData) -> bool:
         upper, lower = data.xpos[self.upper_body], data.xpos[self.lower_body]
@@ -380,8 +391,14 @@ class _OnGoal:
         # The known contacts are those before the last substep. Finding them anew costs time.
         mujoco.mj_collision(model, data)
         pairs = data.contact.geom
-        is_upper, is_lower = np.isin(pairs, self.upper_geoms), np.isin(pairs, self.lower_geoms)
+        is_upper, is_lower = self.is_upper[pairs], self.is_lower[pairs]
         return bool(((is_upper[:, 0] & is_lower[:, 1]) | (is_lower[:, 0] & is_upper[:, 1])).any())
+
+
+def _geom_mask(model: mujoco.MjModel, names: list[str]) -> NDArray[np.bool_]:
+    mask = np.zeros(model.ngeom, dtype=np.bool_)
+    mask[[model.geom(name).id for name in names]] = True
+    return mask
 
 
 class _StockStepper:
