@@ -26,6 +26,8 @@ COMMANDS = {
     "collect": ("curation_ros.cli.collect", "record simulated demonstrations, without ROS"),
     "train": ("curation_ros.cli.train", "train a policy on a selection"),
     "evaluate": ("curation_ros.cli.evaluate", "count a policy's successes over start states"),
+    "benchmark": ("curation_ros.cli.benchmark", "run a study: which selection trains best"),
+    "report": ("curation_ros.cli.report", "draw a study's results: HTML, Markdown"),
     "demo": ("curation_ros.cli.demo", "the whole path, from recording to the trained policy"),
 }
 DONE, FINDINGS, USAGE, NOTHING, FAULT = 0, 1, 2, 3, 70

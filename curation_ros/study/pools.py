@@ -76,8 +76,11 @@ class TrainingSet:
 
 def collect_datasets(
     folder: Path, plan: StudyPlan, *, jobs: int, backend: str, said: Said
-) -> dict[str, Dataset]:
+) -> tuple[dict[str, Dataset], int]:
     """Collect what is missing of the reference (`reference`) and of the pools.
+
+    Returns:
+        Datasets by name, and how many demonstrations were collected now.
 
     Raises:
         ConfigError: if a start state is used twice among them and the rollouts.
@@ -85,7 +88,7 @@ def collect_datasets(
     """
     wanted = {"reference": plan.reference, **plan.pools}
     check_starts(plan)
-    made = {}
+    made, n_new = {}, 0
     for name, settings in wanted.items():
         collection = _collection(settings, name)
         problems, n_known, n = [], 0, 0
@@ -98,7 +101,8 @@ def collect_datasets(
             raise CurationError(f"dataset {folder / name}: {'; '.join(problems)}")
         said(f"dataset {name}: {n} demonstrations, {n_known} of them there before")
         made[name] = Dataset(folder / name)
-    return made
+        n_new += n - n_known
+    return made, n_new
 
 
 def check_starts(plan: StudyPlan) -> None:

@@ -1,0 +1,121 @@
+"""`curation benchmark`: a study from its plan to its report; killed at any point, it goes on."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from curation_ros.cli.arguments import add_workers
+from curation_ros.cli.output import print_json, progress_console, say, warn
+from curation_ros.configuration import share_file
+from curation_ros.core.errors import CurationError
+from curation_ros.dataset import named_errors, write_atomically
+
+_DONE, _NOTHING = 0, 3
+#: Problems that are shown; `results.json` has all of them.
+_SHOWN = 10
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument(
+        "--config", type=Path, help="the plan; default config/paper.yaml, which explains the keys"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("results"), help="the study is in OUT/<name>"
+    )
+    parser.add_argument(
+        "--data", type=Path, help="where its demonstrations are, or go; default OUT/data"
+    )
+    parser.add_argument(
+        "--dry-run", action="store_true", help="collect and score, then say what would be done"
+    )
+    parser.add_argument(
+        "--no-report", action="store_true", help="results.json alone; needs no matplotlib"
+    )
+    add_workers(parser)
+    parser.set_defaults(jobs=-1)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run it, and write results.json and the reports."""
+    from curation_ros.study.plan import read_plan
+    from curation_ros.study.results import results
+    from curation_ros.study.running import run_study
+
+    plan = read_plan(args.config or share_file("config/paper.yaml"))
+    folder = args.out / plan.name
+    if not args.no_report and not args.dry_run:
+        _check_report()
+    with named_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=progress_console,
+        transient=True,
+        disable=args.json,
+    ) as bar:
+        task = bar.add_task(plan.name, total=None)
+
+        def said(text: str) -> None:
+            if not args.json:
+                bar.console.print(text, markup=False, soft_wrap=True)
+
+        study = run_study(
+            plan,
+            folder,
+            args.data or args.out / "data",
+            jobs=args.jobs,
+            backend=args.backend,
+            said=said,
+            ticked=lambda what, n, of: bar.update(task, description=what, completed=n, total=of),
+            work=not args.dry_run,
+        )
+    if args.dry_run:
+        return _DONE
+    found = results(study)
+    path = folder / "results.json"
+    write_atomically(path, json.dumps(found, indent=None, allow_nan=False) + "\n")
+    written = [path]
+    if not args.no_report:
+        from curation_ros.reporting import write_report
+
+        written += write_report(found, folder)
+    missing = sum(stage["missing"] for stage in found["stages"])
+    if args.json:
+        print_json(
+            {
+                "results": str(path),
+                "written": [str(p) for p in written],
+                "rollouts": found["budget"]["rollouts"],
+                "missing": missing,
+                "steps": found["budget"]["used_steps"],
+                "problems": list(study.problems),
+            }
+        )
+    else:
+        for problem in study.problems[:_SHOWN]:
+            warn(problem)
+        if len(study.problems) > _SHOWN:
+            warn(f"and {len(study.problems) - _SHOWN} more, see {path}")
+        if missing:
+            warn(f"{missing} rollouts are missing; the same command again tries what may be tried")
+        for one in written:
+            say(str(one))
+    return _DONE if found["budget"]["rollouts"] else _NOTHING
+
+
+def _check_report() -> None:
+    """Better said before an hour of work than after it."""
+    import importlib.util
+
+    if importlib.util.find_spec("matplotlib") is None:
+        raise CurationError(
+            "the report needs matplotlib: install the extra [report], or say --no-report"
+        )

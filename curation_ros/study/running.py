@@ -1,0 +1,251 @@
+"""Runs a study: collects, scores, trains and rolls out what its plan says and is not done yet."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from curation_ros.auditing import read_episodes
+from curation_ros.core.errors import CurationError
+from curation_ros.dataset import Dataset, append_line, named_errors, read_lines
+from curation_ros.judging import Judge, PolicyUnit, RolloutUnit, Row, Work
+from curation_ros.study.plan import Stage, StudyPlan
+from curation_ros.study.pools import (
+    Pool,
+    TrainingSet,
+    check_starts,
+    collect_datasets,
+    score_pool,
+    training_set,
+)
+
+Said = Callable[[str], None]
+#: What is told of a unit that was done: which stage, what kind, how many of how many.
+Ticked = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A training set with a variant of the observations in a stage, and its policies.
+
+    Attributes:
+        stage: of the plan.
+        variant: of the observations.
+        training_set: what the policies learn from.
+        policies: training seed -> id of the policy.
+    """
+
+    stage: Stage
+    variant: str
+    training_set: TrainingSet
+    policies: Mapping[int, str]
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study as far as it has come.
+
+    Attributes:
+        plan: of it.
+        judge: that has its policies and rollouts.
+        pools: by name, scored.
+        reference: trusted demonstrations.
+        cells: all of the plan, in its order.
+        problems: what failed or was not begun, a line each.
+        seconds: what took how long, in all runs so far.
+        n_reference: trusted demonstrations, how many.
+    """
+
+    plan: StudyPlan
+    judge: Judge
+    pools: Mapping[str, Pool]
+    reference: Dataset
+    cells: tuple[Cell, ...]
+    problems: tuple[str, ...]
+    seconds: tuple[Row, ...]
+    n_reference: int
+
+
+def run_study(
+    plan: StudyPlan,
+    folder: Path,
+    data: Path,
+    *,
+    jobs: int = 1,
+    backend: str = "loky",
+    said: Said = lambda text: None,
+    ticked: Ticked = lambda what, done, of: None,
+    work: bool = True,
+) -> Study:
+    """Do what a plan says and an earlier run has not done.
+
+    Args:
+        plan: what to do.
+        folder: of the study: policies, `units.jsonl`, `seconds.jsonl`.
+        data: where the datasets are, or are collected; studies may share them.
+        jobs: workers.
+        backend: of the workers.
+        said: called with a line about each part.
+        ticked: called as units are done.
+        work: whether to train and roll out; False: only take stock.
+
+    Raises:
+        ConfigError: if the plan makes no sense or is not the one that the folder was begun with.
+        CurationError: if a dataset cannot be completed or scored, or a file cannot be written.
+    """
+    check_starts(plan)
+    clock = _Clock(folder / "seconds.jsonl")
+    with clock.measured("collect") as fact:
+        datasets, fact["units"] = collect_datasets(
+            data, plan, jobs=jobs, backend=backend, said=said
+        )
+    reference, problems = read_episodes(datasets["reference"])
+    if problems:
+        raise CurationError(f"reference: {'; '.join(problems)}")
+    pools = {}
+    with clock.measured("score and audit"):
+        for name in plan.pools:
+            pools[name] = score_pool(name, datasets[name], reference, plan)
+            said(f"pool {name}: {len(plan.scorers)} scorers, {pools[name].facts['n']} scored")
+    judge = Judge(
+        folder,
+        jobs=jobs,
+        backend=backend,
+        max_steps=plan.max_steps,
+        gives_up=plan.gives_up,
+        budget_steps=plan.budget_steps,
+    )
+    cells = tuple(_cells(plan, pools, datasets["reference"]))
+    said(
+        f"{len(cells)} cells, {len({p for c in cells for p in c.policies.values()})} policies; "
+        f"{judge.used_steps} of {plan.budget_steps} simulation steps are used"
+    )
+    found: list[str] = []
+    for (stage, pool, variant), part in _parts(cells).items() if work else ():
+        label = f"{stage}: {pool}, {variant}"
+        found += _train(judge, plan, part, label, clock, said, ticked)
+        found += _roll(judge, part, label, clock, said, ticked)
+    return Study(
+        plan=plan,
+        judge=judge,
+        pools=pools,
+        reference=datasets["reference"],
+        cells=cells,
+        problems=tuple(dict.fromkeys(found)),
+        seconds=tuple(clock.all()),
+        n_reference=len(reference),
+    )
+
+
+def _cells(plan: StudyPlan, pools: Mapping[str, Pool], reference: Dataset) -> Iterator[Cell]:
+    sets: dict[tuple[str, str], TrainingSet] = {}
+    for stage in plan.stages:
+        for pool, variant, row in stage.cells():
+            if (pool, row) not in sets:
+                sets[pool, row] = training_set(pools[pool], row, reference, plan.selection_seed)
+            made = sets[pool, row]
+            # Equal sets have equal ids, so their policies are the same, and are trained once.
+            units = {
+                seed: PolicyUnit(made.id, variant, seed, (), plan.gradient_steps).key
+                for seed in stage.seeds_of(row)
+            }
+            yield Cell(stage, variant, made, units)
+
+
+def _parts(cells: tuple[Cell, ...]) -> dict[tuple[str, str, str], list[Cell]]:
+    """Cells of a stage, pool and variant: done together, and timed."""
+    parts: dict[tuple[str, str, str], list[Cell]] = {}
+    for cell in cells:
+        key = (cell.stage.name, cell.training_set.pool, cell.variant)
+        parts.setdefault(key, []).append(cell)
+    return parts
+
+
+def _train(
+    judge: Judge,
+    plan: StudyPlan,
+    cells: list[Cell],
+    label: str,
+    clock: _Clock,
+    said: Said,
+    ticked: Ticked,
+) -> list[str]:
+    units = {
+        key: PolicyUnit(
+            set_id=cell.training_set.id,
+            variant=cell.variant,
+            seed=seed,
+            bags=tuple((bag, None) for bag in cell.training_set.bags),
+            steps=plan.gradient_steps,
+            selection=(f"{cell.training_set.pool}/{cell.training_set.row}", cell.training_set.id),
+        )
+        for cell in cells
+        for seed, key in cell.policies.items()
+    }
+    n = 0
+
+    def tick(row: Row) -> None:
+        nonlocal n
+        n += 1
+        ticked(f"{label}: trained", n, len(units))
+
+    with clock.measured("train", label) as fact:
+        work = judge.train(list(units.values()), tick)
+        fact["units"] = len(work.done)
+    said(f"{label}: {len(work.done)} policies trained, {work.known} known, {len(work.failed)} not")
+    return [f"policy {row['policy']}: {row['reason']}" for row in work.failed]
+
+
+def _roll(
+    judge: Judge, cells: list[Cell], label: str, clock: _Clock, said: Said, ticked: Ticked
+) -> list[str]:
+    from sim_node.starts import start_names
+
+    units = [
+        RolloutUnit(policy, start)
+        for cell in cells
+        for policy in cell.policies.values()
+        for start in start_names(cell.stage.starts)
+    ]
+    wanted, n = len(set(units)), 0
+
+    def tick(row: Row) -> None:
+        nonlocal n
+        n += 1
+        ticked(f"{label}: rolled out", n, wanted)
+
+    with clock.measured("roll", label) as fact:
+        work: Work = judge.roll(units, tick)
+        fact["units"] = len(work.done)
+        fact["steps"] = sum(int(row["steps"]) for row in work.done)
+    said(
+        f"{label}: {len(work.done)} rollouts done, {work.known} known, "
+        f"{len(work.failed) + len(work.missing)} not"
+    )
+    failed = [f"rollout of {r['policy']} from {r['start']}: {r['reason']}" for r in work.failed]
+    return failed + list(work.missing)
+
+
+class _Clock:
+    """Wall time of each part of each run, in a file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @contextmanager
+    def measured(self, what: str, part: str = "") -> Iterator[Row]:
+        """Measure a part, and note it where it has done something; facts may be added."""
+        row: Row = {"what": what, "part": part}
+        began_s = time.monotonic()
+        yield row
+        row["seconds"] = round(time.monotonic() - began_s, 2)
+        if row.get("units", 1):
+            with named_errors(self._path):
+                append_line(self._path, row)
+
+    def all(self) -> list[Row]:
+        """What was noted, oldest first."""
+        return read_lines(self._path)
