@@ -20,7 +20,7 @@ KINDS = ("protocol", "screen", "confirm")
 #: Training sets that no scorer makes: name -> (what it needs, what it is, whether it takes @K).
 CONTROLS: dict[str, tuple[str, str, bool]] = {
     "everything": ("nothing", "all of the contaminated demonstrations", False),
-    "random": ("nothing", "K drawn at random; #N is the draw", True),
+    "random": ("nothing", "K drawn at random; #N is the draw, else each seed has its own", True),
     "oracle": ("labels", "those that succeeded; with @K also defective ones, up to K", True),
     "worst": ("labels", "K, defective ones first", True),
     "shuffled": ("labels", "K as the oracle keeps them, by labels that were shuffled", True),
@@ -43,14 +43,19 @@ class Term:
     Attributes:
         name: a scorer, or one of CONTROLS.
         keep: how many to keep, best first; None where the set has a size of its own.
-        draw: of `random` and `shuffled`.
+        draw: of `random` and `shuffled`; None: every training seed has a draw of its own.
         wrong: of `button`: wrong presses of 100.
     """
 
     name: str
     keep: int | None = None
-    draw: int = 0
+    draw: int | None = None
     wrong: int = 0
+
+    @property
+    def is_drawn(self) -> bool:
+        """Whether training seeds have sets of their own."""
+        return self.name in ("random", "shuffled") and self.draw is None
 
 
 def parse_row(text: str) -> tuple[Term, ...]:
@@ -72,11 +77,12 @@ def parse_row(text: str) -> tuple[Term, ...]:
                 f"training set {text!r}: {name} "
                 + ("needs a number to keep, as in " + name + "@16" if sized else "takes no @K")
             )
-        if found[3] and name not in ("random", "shuffled"):
+        if found[3] is not None and name not in ("random", "shuffled"):
             raise ConfigError(f"training set {text!r}: {name} has no draws")
         if (found[4] is None) == (name == "button"):
             raise ConfigError(f"training set {text!r}: %P is for button, as in button%10")
-        terms.append(Term(name, keep, int(found[3] or 0), int(found[4] or 0)))
+        draw = None if found[3] is None else int(found[3])
+        terms.append(Term(name, keep, draw, int(found[4] or 0)))
     return tuple(terms)
 
 
@@ -111,7 +117,8 @@ class Stage:
         starts: of the rollouts, such as official:0:50; the same for every policy.
         rows: training sets, in the order in which they are worked on.
         contrasts: planned comparisons; training sets that these need are rows, too.
-        draw_seeds: seeds, of `seeds` the first so many, of each draw of a random control.
+        draw_seeds: seeds of each draw of a control that is named with its draw; draws share the
+            seeds out.
     """
 
     name: str
@@ -132,12 +139,11 @@ class Stage:
         return list(dict.fromkeys(planned))
 
     def seeds_of(self, row: str) -> tuple[int, ...]:
-        """Training seeds of a row: draws of a control share them out."""
-        [*terms] = parse_row(row)
-        drawn = [t for t in terms if t.name in ("random", "shuffled")]
-        if not drawn or self.draw_seeds >= len(self.seeds):
+        """Training seeds of a row."""
+        draws = [t.draw for t in parse_row(row) if t.draw is not None]
+        if not draws:
             return self.seeds
-        first = drawn[0].draw % len(self.seeds)
+        first = draws[0] % len(self.seeds)
         return tuple(self.seeds[(first + k) % len(self.seeds)] for k in range(self.draw_seeds))
 
 
@@ -192,18 +198,18 @@ def read_plan(path: Path) -> StudyPlan:
     Raises:
         ConfigError: naming file and key.
     """
-    where = f"study {path}"
-    raw = _read_yaml(path, where)
+    raw = _read_yaml(path)
+    for stage in raw.get("stages") or ():
+        beside = stage.pop("contrasts_file", None) if isinstance(stage, dict) else None
+        if beside is not None:
+            contrasts = _read_yaml(path.parent / str(beside))
+            stage["contrasts"] = contrasts.get("contrasts")
     try:
-        for stage in raw.get("stages", ()):
-            beside = stage.pop("contrasts_file", None) if isinstance(stage, dict) else None
-            if beside is not None:
-                stage["contrasts"] = _read_yaml(path.parent / str(beside), where)["contrasts"]
         return plan_from(raw)
     except ConfigError as err:
-        raise ConfigError(f"{where}: {err}") from err
+        raise ConfigError(f"study {path}: {err}") from err
     except (KeyError, TypeError, ValueError, AttributeError) as err:
-        raise ConfigError(f"{where}: {type(err).__name__}: {err}") from err
+        raise ConfigError(f"study {path}: {type(err).__name__}: {err}") from err
 
 
 def plan_from(raw: Mapping[str, Any]) -> StudyPlan:
@@ -314,13 +320,16 @@ def _checked(raw: Any, kind: type[Any], what: str, leave: Sequence[str] = ()) ->
     return dict(raw)
 
 
-def _read_yaml(path: Path, where: str) -> dict[str, Any]:
+def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         raw = yaml.safe_load(path.read_text())
     except OSError as err:
-        raise ConfigError(f"{where}: {path}: {err.strerror}") from err
+        raise ConfigError(f"{path}: {err.strerror}") from err
     except (yaml.YAMLError, ValueError) as err:
-        raise ConfigError(f"{where}: {path} is not YAML: {str(err).splitlines()[0]}") from err
+        mark = getattr(err, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark is not None else ""
+        what = getattr(err, "problem", None) or str(err).splitlines()[0]
+        raise ConfigError(f"{path}{line}: not YAML: {what}") from err
     if not isinstance(raw, dict):
-        raise ConfigError(f"{where}: {path}: expected a mapping, found {raw!r:.60}")
+        raise ConfigError(f"{path}: expected a mapping, found {raw!r:.60}")
     return raw

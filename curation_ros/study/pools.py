@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -245,7 +245,9 @@ def _needs(found: set[str]) -> tuple[str, ...]:
     return tuple(sorted(found - {"nothing"})) or ("nothing",)
 
 
-def training_set(pool: Pool, row: str, reference: Dataset, seed: int) -> TrainingSet:
+def training_set(
+    pool: Pool, row: str, reference: Dataset, seed: int, draw: int = 0
+) -> TrainingSet:
     """The demonstrations that a row of a study means.
 
     Args:
@@ -253,6 +255,7 @@ def training_set(pool: Pool, row: str, reference: Dataset, seed: int) -> Trainin
         row: such as `knn@16`, see `curation_ros.study.plan.parse_row`.
         reference: the trusted demonstrations.
         seed: of equal scores and of the controls.
+        draw: of the controls that name none.
 
     Raises:
         CurationError: if there are too few to keep.
@@ -268,7 +271,7 @@ def training_set(pool: Pool, row: str, reference: Dataset, seed: int) -> Trainin
             n_reference = len(trusted)
             bags |= {bag.name: bag for bag in trusted}
             continue
-        ids, tied = _kept(pool, term, seed)
+        ids, tied = _kept(pool, replace(term, draw=draw) if term.is_drawn else term, seed)
         chosen |= set(ids)
         needs |= set(pool.needs[term.name] if term.name in SCORERS else (CONTROLS[term.name][0],))
     bags |= {i: pool.dataset.bag_path(i) for i in chosen}
@@ -322,7 +325,7 @@ def _labels(pool: Pool, term: Term, seed: int) -> dict[str, float]:
     order = sorted(pool.episodes, key=lambda i: pool.names[i])
     good = np.array([pool.good[i] for i in order], dtype=np.float64)
     if term.name == "shuffled":
-        good = np.random.default_rng([seed, term.draw, 1]).permutation(good)
+        good = np.random.default_rng([seed, term.draw or 0, 1]).permutation(good)
     if term.name == "worst":
         good = -good
     return dict(zip(order, good.tolist(), strict=True))

@@ -91,10 +91,7 @@ def _versions() -> dict[str, str]:
 
 def _keep_counts(study: Study) -> list[int]:
     counts = {
-        term.keep
-        for cell in study.cells
-        for term in parse_row(cell.training_set.row)
-        if term.keep is not None
+        term.keep for cell in study.cells for term in parse_row(cell.row) if term.keep is not None
     }
     return sorted({*counts, study.plan.keep_for_audit})
 
@@ -110,7 +107,7 @@ def _stage(study: Study, stage: Stage, rollouts: Mapping[tuple[str, str], Row]) 
     return {
         "name": stage.name,
         "kind": stage.kind,
-        "pools": sorted({cell.training_set.pool for cell in cells}),
+        "pools": sorted({cell.pool for cell in cells}),
         "variants": list(dict.fromkeys(cell.variant for cell in cells)),
         "seeds": list(stage.seeds),
         "starts": starts,
@@ -122,7 +119,7 @@ def _stage(study: Study, stage: Stage, rollouts: Mapping[tuple[str, str], Row]) 
 
 
 def _key(cell: Cell) -> tuple[str, str, str]:
-    return (cell.training_set.pool, cell.variant, cell.training_set.row)
+    return (cell.pool, cell.variant, cell.row)
 
 
 def _outcomes(
@@ -150,13 +147,13 @@ def _row(
         for start in starts
         if (policy, start) in rollouts
     ]
-    pool = study.pools[cell.training_set.pool]
-    terms = parse_row(cell.training_set.row)
+    pool = study.pools[cell.pool]
+    terms = parse_row(cell.row)
     scorer = next((t.name for t in terms if t.name in SCORERS), "")
     audited: Mapping[str, Any] = next((r for r in pool.audited if r["scorer"] == scorer), {})
     row: Row = {
         "variant": cell.variant,
-        **cell.training_set.to_json(),
+        **_sets(cell),
         "scorer": scorer,
         "keep": next((t.keep for t in terms if t.keep is not None), None),
         "auroc": audited.get("auroc_controlled"),
@@ -195,6 +192,17 @@ def _row(
             "modes": {"low": found.low, "middle": found.middle, "high": found.high},
         }
     return row
+
+
+def _sets(cell: Cell) -> Row:
+    """What is in the training set; of one that is drawn for each seed the means, and no ids."""
+    different = {made.id: made for made in cell.sets.values()}
+    described = [made.to_json() for made in different.values()]
+    first = described[0]
+    if len(described) == 1:
+        return first
+    means = {key: mean(d[key] for d in described) for key in ("n_good", "contamination")}
+    return {**first, **means, "set": "+".join(sorted(different)), "episodes": []}
 
 
 def _counted(values: Iterable[str]) -> dict[str, int]:

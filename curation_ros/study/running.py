@@ -12,7 +12,7 @@ from curation_ros.auditing import read_episodes
 from curation_ros.core.errors import CurationError
 from curation_ros.dataset import Dataset, append_line, named_errors, read_lines
 from curation_ros.judging import Judge, PolicyUnit, RolloutUnit, Row, Work
-from curation_ros.study.plan import Stage, StudyPlan
+from curation_ros.study.plan import Stage, StudyPlan, parse_row
 from curation_ros.study.pools import (
     Pool,
     TrainingSet,
@@ -34,14 +34,31 @@ class Cell:
     Attributes:
         stage: of the plan.
         variant: of the observations.
-        training_set: what the policies learn from.
-        policies: training seed -> id of the policy.
+        sets: training seed -> what its policy learns from: the same for all, but for controls
+            that are drawn anew for each seed.
     """
 
     stage: Stage
     variant: str
-    training_set: TrainingSet
-    policies: Mapping[int, str]
+    sets: Mapping[int, TrainingSet]
+
+    @property
+    def pool(self) -> str:
+        """Name of the pool."""
+        return next(iter(self.sets.values())).pool
+
+    @property
+    def row(self) -> str:
+        """What the plan calls the training set."""
+        return next(iter(self.sets.values())).row
+
+    @property
+    def policies(self) -> dict[int, str]:
+        """Training seed -> id of the policy; equal sets have the same policies."""
+        return {
+            seed: PolicyUnit(made.id, self.variant, seed, ()).key
+            for seed, made in self.sets.items()
+        }
 
 
 @dataclass(frozen=True)
@@ -141,25 +158,27 @@ def run_study(
 
 
 def _cells(plan: StudyPlan, pools: Mapping[str, Pool], reference: Dataset) -> Iterator[Cell]:
-    sets: dict[tuple[str, str], TrainingSet] = {}
+    made: dict[tuple[str, str, int], TrainingSet] = {}
     for stage in plan.stages:
         for pool, variant, row in stage.cells():
-            if (pool, row) not in sets:
-                sets[pool, row] = training_set(pools[pool], row, reference, plan.selection_seed)
-            made = sets[pool, row]
-            # Equal sets have equal ids, so their policies are the same, and are trained once.
-            units = {
-                seed: PolicyUnit(made.id, variant, seed, (), plan.gradient_steps).key
-                for seed in stage.seeds_of(row)
-            }
-            yield Cell(stage, variant, made, units)
+            is_drawn = any(term.is_drawn for term in parse_row(row))
+            sets = {}
+            for seed in stage.seeds_of(row):
+                draw = stage.seeds.index(seed) if is_drawn else 0
+                key = (pool, row, draw)
+                if key not in made:
+                    made[key] = training_set(
+                        pools[pool], row, reference, plan.selection_seed, draw
+                    )
+                sets[seed] = made[key]
+            yield Cell(stage, variant, sets)
 
 
 def _parts(cells: tuple[Cell, ...]) -> dict[tuple[str, str, str], list[Cell]]:
     """Cells of a stage, pool and variant: done together, and timed."""
     parts: dict[tuple[str, str, str], list[Cell]] = {}
     for cell in cells:
-        key = (cell.stage.name, cell.training_set.pool, cell.variant)
+        key = (cell.stage.name, cell.pool, cell.variant)
         parts.setdefault(key, []).append(cell)
     return parts
 
@@ -174,16 +193,16 @@ def _train(
     ticked: Ticked,
 ) -> list[str]:
     units = {
-        key: PolicyUnit(
-            set_id=cell.training_set.id,
+        cell.policies[seed]: PolicyUnit(
+            set_id=made.id,
             variant=cell.variant,
             seed=seed,
-            bags=tuple((bag, None) for bag in cell.training_set.bags),
+            bags=tuple((bag, None) for bag in made.bags),
             steps=plan.gradient_steps,
-            selection=(f"{cell.training_set.pool}/{cell.training_set.row}", cell.training_set.id),
+            selection=(f"{made.pool}/{made.row}", made.id),
         )
         for cell in cells
-        for seed, key in cell.policies.items()
+        for seed, made in cell.sets.items()
     }
     n = 0
 
