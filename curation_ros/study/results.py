@@ -24,6 +24,9 @@ _PACKAGES = (
     *("torch", "numba"),
 )
 
+#: Needs that everybody can meet who has the demonstrations.
+_FREE = {"nothing", "dataset"}
+
 Outcomes = dict[tuple[int, str], bool]
 
 
@@ -151,13 +154,15 @@ def _row(
     terms = parse_row(cell.row)
     scorer = next((t.name for t in terms if t.name in SCORERS), "")
     audited: Mapping[str, Any] = next((r for r in pool.audited if r["scorer"] == scorer), {})
+    # What is ranked by: the score under length control, but for the baseline of length itself.
+    raw = scorer in SCORERS and not SCORERS[scorer].length_controlled
     row: Row = {
         "variant": cell.variant,
         **_sets(cell),
         "scorer": scorer,
         "keep": next((t.keep for t in terms if t.keep is not None), None),
-        "auroc": audited.get("auroc_controlled"),
-        "auroc_ci": audited.get("ci"),
+        "auroc": audited.get("auroc_raw" if raw else "auroc_controlled"),
+        "auroc_ci": audited.get("ci_raw" if raw else "ci"),
         "auroc_raw": audited.get("auroc_raw"),
         "n_missing": len(cell.policies) * len(starts) - len(done),
         "outcomes": {
@@ -224,13 +229,13 @@ def _compare(rows: list[Row]) -> None:
         row["rival"] = None
         if not row["scorer"] or row["rate"] is None:
             continue
-        own = set(row["needs"]) - {"nothing"}
+        own = set(row["needs"]) - _FREE
         rivals = [
             r
             for r in same
             if r["rate"] is not None
             and not r["scorer"]
-            and set(r["needs"]) - {"nothing"} <= own
+            and set(r["needs"]) - _FREE <= own
             and r["set"] != row["set"]
         ]
         if rivals:
