@@ -33,7 +33,7 @@ BUDGET_STEPS = 4_000_000
 #: Runs that try a unit before it stays failed.
 ATTEMPTS = 2
 # Rollouts and policies that a worker gets at once: what a kill may cost.
-_ROLLOUTS, _POLICIES = 10, 10
+_ROLLOUTS, _POLICIES = 10, 8
 _DIED = "its worker died (killed, or out of memory)"
 
 Row = dict[str, Any]
@@ -229,7 +229,8 @@ class Judge:
                     )
             todo = past.todo(units)
             # Workers get about as much each; policies of one variant are computed together.
-            size = min(_POLICIES, max(1, -(-len(todo) // self._n_workers)))
+            rounds = max(1, -(-len(todo) // (_POLICIES * self._n_workers)))
+            size = max(1, -(-len(todo) // (rounds * self._n_workers)))
             alike = sorted(todo, key=lambda u: (u.variant, u.steps, u.start_jitter_m))
             groups = groupby(alike, key=lambda u: (u.variant, u.steps, u.start_jitter_m))
             tasks = [part for _, group in groups for part in _parts(list(group), size)]

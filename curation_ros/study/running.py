@@ -114,7 +114,7 @@ def run_study(
         CurationError: if a dataset cannot be completed or scored, or a file cannot be written.
     """
     check_starts(plan)
-    clock = _Clock(folder / "seconds.jsonl")
+    clock = _Clock(folder / "seconds.jsonl", notes=work)
     with clock.measured("collect") as fact:
         datasets, fact["units"] = collect_datasets(
             data, plan, jobs=jobs, backend=backend, said=said
@@ -251,8 +251,8 @@ def _roll(
 class _Clock:
     """Wall time of each part of each run, in a file."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, notes: bool) -> None:
+        self._path, self._notes = path, notes
 
     @contextmanager
     def measured(self, what: str, part: str = "") -> Iterator[Row]:
@@ -261,7 +261,7 @@ class _Clock:
         began_s = time.monotonic()
         yield row
         row["seconds"] = round(time.monotonic() - began_s, 2)
-        if row.get("units", 1):
+        if self._notes and row.get("units", 1):
             with named_errors(self._path):
                 append_line(self._path, row)
 
