@@ -1,0 +1,35 @@
+"""`curation report`: a study's results for people."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from curation_ros.cli.output import print_json, say
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("results", type=Path, help="results.json of `curation benchmark`")
+    parser.add_argument(
+        "--out", type=Path, help="folder of the report; default: where the results are"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the report and say where it is."""
+    from curation_ros.reporting import read_results, write_report
+
+    found = read_results(args.results)
+    written = write_report(found, args.out or args.results.parent)
+    missing = sum(stage["missing"] for stage in found["stages"])
+    if args.json:
+        print_json(
+            {"report": str(written[0]), "written": [str(p) for p in written], "missing": missing}
+        )
+    else:
+        for path in written:
+            say(str(path))
+        if missing:
+            say(f"{missing} outcomes are missing; the report says which")
+    return 0
