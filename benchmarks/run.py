@@ -11,6 +11,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 BENCHMARKS = (
+    "closed_loop",
     "sim_speed",
     "decoding",
     "graph_speed",

@@ -1,7 +1,7 @@
-"""Control steps a second: LIBERO's `env.step`, our lean loop, and bare MuJoCo, side by side.
+"""Seconds until an episode can begin: from a fresh interpreter, and by a reset, on either path.
 
-The machine is rarely idle, so the three take turns in one process, and ratios are taken within a
-round; each figure is a median over rounds.
+Steps a second are measured with a policy in the loop, by `closed_loop`. The machine is rarely
+idle, so the paths take turns, and each figure is a median over rounds.
 """
 
 from __future__ import annotations
@@ -11,20 +11,14 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from typing import Any
-
-import mujoco
-import numpy as np
 
 from sim_node.env import LiberoEnv
 from sim_node.starts import generated_start
 
-COMMAND = "python benchmarks/sim_speed.py"
-N_ROUNDS = 7
-N_STEPS = 60
+COMMAND = "python benchmarks/run.py sim_speed"
+N_RESETS = 7
 N_STARTS = 3
-TARGET_RATIO = 2.5
 
 
 def fresh_start_s(lean: bool) -> float:
@@ -38,103 +32,42 @@ def fresh_start_s(lean: bool) -> float:
     return time.perf_counter() - started_s
 
 
-def run(n_rounds: int = N_ROUNDS, n_steps: int = N_STEPS) -> list[dict[str, Any]]:
-    """Measure and return one row a figure.
-
-    Args:
-        n_rounds: turns that each way of stepping takes.
-        n_steps: control steps a turn.
-    """
-    state = generated_start(0, 0).state
-    actions = np.random.default_rng(0).uniform(-0.2, 0.2, (n_steps, 3))
+def reset_s() -> dict[bool, list[float]]:
+    """Seconds of each reset, settling included, by whether the path is lean."""
+    seconds: dict[bool, list[float]] = {True: [], False: []}
     with LiberoEnv() as lean, LiberoEnv(lean=False) as stock:
+        for k in range(N_RESETS + 1):
+            for env in (lean, stock):
+                env.reset(generated_start(0, k).state)
+                if k > 0:  # the first one warms up
+                    seconds[env.lean].append(env.reset_s)
+    return seconds
 
-        def commanded(env: LiberoEnv) -> Callable[[int], None]:
-            def step(k: int) -> None:
-                env.step(actions[k], -1.0)
-                env.is_success()
 
-            return step
-
-        def bare(k: int) -> None:
-            # The same scene without controller: the arm hangs in its own gravity compensation.
-            lean.data.ctrl[:7] = lean.data.qfrc_bias[:7]
-            mujoco.mj_step(lean.model, lean.data, nstep=25)
-
-        steppers = {
-            "stock": (stock, commanded(stock)),
-            "lean": (lean, commanded(lean)),
-            "bare": (lean, bare),
-        }
-        rates: dict[str, list[float]] = {name: [] for name in steppers}
-        resets: dict[str, list[float]] = {"stock": [], "lean": []}
-        for round_index in range(n_rounds + 1):
-            for name, (env, step) in steppers.items():
-                env.reset(state)
-                started_s = time.perf_counter()
-                for k in range(n_steps):
-                    step(k)
-                elapsed_s = time.perf_counter() - started_s
-                if round_index == 0:
-                    continue  # compiles and warms up
-                rates[name].append(n_steps / elapsed_s)
-                if name in resets:
-                    resets[name].append(env.reset_s)
-
-    def ratio(over: str, under: str) -> float:
-        return statistics.median(a / b for a, b in zip(rates[over], rates[under], strict=True))
-
-    def row(
-        name: str, value: float, unit: str, against: str = "", **extra: float | str | bool
-    ) -> dict[str, Any]:
-        empty = {"ratio": None, "target": None, "holds": None}
-        return {
-            "name": name,
-            "value": value,
-            "unit": unit,
-            "against": against,
-            **empty,
-            **extra,
-            "command": COMMAND,
-        }
-
-    start_s = {
-        name: statistics.median(fresh_start_s(name == "lean") for _ in range(N_STARTS))
-        for name in resets
-    }
-    median = {name: statistics.median(values) for name, values in rates.items()}
-    speedup = ratio("lean", "stock")
-    return [
-        row("sim stock", median["stock"], "steps/s"),
-        row(
-            "sim lean",
-            median["lean"],
-            "steps/s",
-            "sim stock",
-            ratio=speedup,
-            target=f"ratio >= {TARGET_RATIO}",
-            holds=speedup >= TARGET_RATIO,
-        ),
-        row(
-            "sim bare mj_step", median["bare"], "steps/s", "sim lean", ratio=ratio("bare", "lean")
-        ),
-        row(
-            "sim start, lean",
-            start_s["lean"],
-            "s",
-            "sim start, stock",
-            ratio=start_s["lean"] / start_s["stock"],
-        ),
-        row("sim start, stock", start_s["stock"], "s"),
-        row(
-            "sim reset, lean",
-            statistics.median(resets["lean"]),
-            "s",
-            "sim reset, stock",
-            ratio=statistics.median(resets["lean"]) / statistics.median(resets["stock"]),
-        ),
-        row("sim reset, stock", statistics.median(resets["stock"]), "s"),
-    ]
+def run() -> list[dict[str, Any]]:
+    """Measure and return one row a figure."""
+    starts: dict[bool, list[float]] = {True: [], False: []}
+    for _ in range(N_STARTS):
+        for lean, values in starts.items():
+            values.append(fresh_start_s(lean))
+    rows = []
+    for name, seconds in (("sim start", starts), ("sim reset", reset_s())):
+        pairs = zip(seconds[True], seconds[False], strict=True)
+        ratio = statistics.median(a / b for a, b in pairs)
+        for lean in (True, False):
+            rows.append(
+                {
+                    "name": f"{name}, {'lean' if lean else 'stock'}",
+                    "value": statistics.median(seconds[lean]),
+                    "unit": "s",
+                    "against": f"{name}, stock" if lean else "",
+                    "ratio": ratio if lean else None,
+                    "target": None,
+                    "holds": None,
+                    "command": COMMAND,
+                }
+            )
+    return rows
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from curation_ros.core.errors import ConfigError, SimError
 from sim_node import quiet_libero
@@ -120,6 +121,27 @@ def test_observation_belongs_to_one_instant(env):
     mujoco.mj_kinematics(env.model, fresh)
     assert np.array_equal(observation.eef_position_m, fresh.site("gripper0_grip_site").xpos)
     assert np.array_equal(observation.objects[BOWL][0], fresh.body(f"{BOWL}_main").xpos)
+
+
+def test_observation_is_what_the_simulator_holds(env):
+    env.reset(official_start(0).state)
+    observation = env.step([0.5, -0.5, -0.5], 1)
+    data = env.data
+    for name in env.object_names:
+        position_m, quat_xyzw = observation.objects[name]
+        body = data.body(f"{name}_main")
+        assert np.array_equal(position_m, body.xpos), name
+        assert np.array_equal(quat_xyzw, [*body.xquat[1:], body.xquat[0]]), name
+    hand = Rotation.from_matrix(data.site("gripper0_grip_site").xmat.reshape(3, 3))
+    turned = hand.inv() * Rotation.from_quat(observation.eef_quat_xyzw)
+    assert turned.magnitude() < 1e-12
+    arm, fingers = data.joint("robot0_joint7"), data.joint("gripper0_finger_joint2")
+    assert observation.joint_position_rad[6] == arm.qpos[0]
+    assert observation.joint_velocity_rad_s[6] == arm.qvel[0]
+    assert observation.joint_effort_nm[6] == arm.qfrc_actuator[0]
+    assert observation.finger_position_m[1] == fingers.qpos[0]
+    assert observation.finger_velocity_m_s[1] == fingers.qvel[0]
+    assert observation.finger_effort_n[1] == fingers.qfrc_actuator[0]
 
 
 def test_observation_has_every_movable_object(env):
