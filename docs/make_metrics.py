@@ -51,6 +51,15 @@ FORMULAS: dict[str, str] = {
     "trajectory_alignment": "m . M / (|m| |M|), m the episode's mean state, M the mean over the "
     "others of theirs",
     "length": "-T",
+    "object_coupling": "1/n * #{t in LIFT, TRANSPORT : S(s) <= h for all s <= t}, back to where S "
+    "began to rise; S(t) = max(0, S(t-1) + min(|o_t - e_t| - r_t - k, 0.6 h)), o and e the "
+    "positions of object and effector, r what their distance was, k = 15 mm + 0.5 sigma, "
+    "h = 12 mm + 4 sigma, sigma the noise of o at rest",
+    "grip_consistency": "1/n * #{t in LIFT, TRANSPORT : w(s) >= 0.025 W(s) and w(s) - min w <= "
+    "0.05 W(s) for all s <= t}, w the gap between the fingers, W its largest so far; with effort "
+    "f: f(s) . f(grasp) / |f(grasp)|^2 >= 0.2",
+    "phase_events": "-s ln(mean over LIFT, TRANSPORT of exp(-v / s)), v the share of the phase's "
+    "steps before the first one commanded open, 1 where there is none; s = 0.1",
 }
 
 #: What the code cannot know: where each score misleads.
@@ -98,6 +107,33 @@ LIES: dict[str, tuple[str, ...]] = {
     "length": (
         "It is the confound itself: where failures run into the time limit it separates them "
         "perfectly without seeing one. A scorer that it explains has shown nothing.",
+    ),
+    "object_coupling": (
+        "It knows that the object came along, not that it came to the right place, nor that it "
+        "was the right one.",
+        "The effector's frame must lie between the fingers: from a flange, an object that turns "
+        "comes nearer or goes farther.",
+        "What slides slowly in the fingers (up to 4 mm a second of an exact pose, more of a noisy "
+        "one) is followed, and is a break only after 4 cm.",
+        "What is lost in the last two or three steps of TRANSPORT counts as put down.",
+        "What was opened early and held all the same (a finger that sticks) scores 1: that is "
+        "what happened, not what was commanded.",
+        "Of a simulator whose objects at rest repeat their pose to the last bit, an object that "
+        "was never touched looks like a tracker that has stopped: it abstains.",
+    ),
+    "grip_consistency": (
+        "What is held may be anything: an object that is not the right one, or a finger's own "
+        "stop above the limit of an empty grip.",
+        "Objects thinner than 2.5 % of the gripper's opening look like none.",
+        "On this simulator's early releases gap and effort show the command that opens, a little "
+        "later than the command itself: they are no independent evidence there.",
+    ),
+    "phase_events": (
+        "It detects early openings by construction and nothing else: a slipped object, an empty "
+        "grasp or a wrong place score as well as a success.",
+        "Phases come from whoever publishes them: a tracker that is wrong about the end of "
+        "TRANSPORT makes every opening early, or none.",
+        "With phases that a person's gripper defines it says nothing.",
     ),
 }
 #: What is true of a form that is fitted on a reference, and not of its twin.
@@ -198,6 +234,8 @@ def parameters(scorer: Scorer) -> str:
         if isinstance(value, bool):
             others = f"`{str(not value).lower()}`"
         rows.append((f"`{name}`", f"`{default}`", others, described[name]))
+    if not rows:
+        return "No parameters."
     return table(("parameter", "default", "other choices", "meaning"), rows)
 
 

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
+from curation_ros.core import gripper
 from curation_ros.core.errors import EpisodeError
 from curation_ros.core.scorers.scorer import Abstain
 
@@ -137,3 +139,28 @@ def phase_name(episode: Episode, step: int) -> str | None:
     if phase is None or not 0 <= phase[step] < len(labels):
         return None
     return labels[int(phase[step])]
+
+
+def checked_command(episode: Episode) -> npt.NDArray[np.int8]:
+    """(T,) what the gripper is commanded to be, as `gripper.commanded` has it, if it is sound.
+
+    Raises:
+        Abstain: if the episode has fewer than two steps, the command is missing, not finite, or
+            contradicts its declared meaning, or it never closes.
+    """
+    if len(episode) < 2:
+        raise Abstain(f"too short: the episode has {len(episode)} steps")
+    try:
+        if not np.isfinite(gripper.gripper_command(episode)).all():
+            raise Abstain("the gripper's command has values that are not finite")
+        inverted = gripper.contradiction(episode)
+        if inverted is not None:
+            raise Abstain(inverted)
+        state = gripper.commanded(episode)
+    except Abstain:
+        raise
+    except EpisodeError as err:
+        raise Abstain(str(err).partition(": ")[2]) from None
+    if not (state < 0).any():
+        raise Abstain("the gripper was never commanded to close")
+    return state

@@ -9,7 +9,7 @@ import numpy as np
 
 from curation_ros.core import gripper
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.scorers.features import phase_name
+from curation_ros.core.scorers.features import checked_command, phase_name
 from curation_ros.core.scorers.scorer import Abstain, Scorer
 from curation_ros.core.stream import NS_PER_S
 
@@ -89,22 +89,12 @@ class GripperTiming(Scorer):
 
     def _opening(self, episode: Episode) -> int | None:
         self.check_params()
+        if self.on == "command":
+            return gripper.opening_of(checked_command(episode))
         if len(episode) < 2:
             raise Abstain(f"too short: the episode has {len(episode)} steps")
         try:
-            if self.on == "command":
-                if not np.isfinite(gripper.gripper_command(episode)).all():
-                    raise Abstain("the gripper's command has values that are not finite")
-                inverted = gripper.contradiction(episode)
-                if inverted is not None:
-                    raise Abstain(inverted)
-                state = gripper.commanded(episode)
-                if not (state < 0).any():
-                    raise Abstain("the gripper was never commanded to close")
-                return gripper.opening_of(state)
             width = gripper.finger_width(episode)
-        except Abstain:
-            raise
         except EpisodeError as err:
             raise Abstain(str(err).partition(": ")[2]) from None
         if width is None:

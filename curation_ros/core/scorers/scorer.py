@@ -32,7 +32,8 @@ class Scorer(ABC):
     Attributes:
         needs: what orients the score. Of an instance it may differ from its class (`ensemble`).
         length_controlled: whether the episode is to be length-controlled before it comes here;
-            false only for a scorer that is itself the baseline of length.
+            false for the baseline of length, and for a scorer that looks at certain phases alone:
+            it is to see all of them, and what follows does not change it.
         resolution: difference in score below which two episodes count as equal; the margin of a
             threshold fitted on references whose scores are all the same.
         version: raised whenever the definition changes, so that old scores are not mixed in.

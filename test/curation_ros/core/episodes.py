@@ -98,8 +98,14 @@ def make_episode(
     width = np.where(lagged, OPEN_WIDTH_M, HELD_WIDTH_M)
     command = np.where(open_command, opens, -opens).astype(np.float64)
 
-    held = ~open_command & (step >= lift_at)
-    bowl = np.where(held[:, None], eef, eef[min(lift_at, n_steps - 1)] if n_steps else 0.0)
+    bowl = np.tile(eef[min(lift_at, n_steps - 1)] if n_steps else np.zeros(3), (n_steps, 1))
+    held = np.flatnonzero(~open_command & (step >= lift_at))
+    bowl[held] = eef[held]
+    if len(held) and held[-1] < n_steps - 1:  # let go, it falls back to where it came from
+        fallen_m = 0.5 * 9.81 * ((step[held[-1] + 1 :] - held[-1]) / rate_hz) ** 2
+        table_m = bowl[held[-1] + 1 :, 2].copy()
+        bowl[held[-1] + 1 :] = eef[held[-1]]
+        bowl[held[-1] + 1 :, 2] = np.maximum(eef[held[-1], 2] - fallen_m, table_m)
     made = {
         "eef_position": eef,
         "eef_quat_xyzw": np.tile([1.0, 0.0, 0.0, 0.0], (n_steps, 1)),

@@ -1,0 +1,81 @@
+"""Whether the fingers held something for as long as something was to be carried."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from curation_ros.core.carrying import Carrying
+from curation_ros.core.errors import ConfigError
+from curation_ros.core.grip import grip_of
+from curation_ros.core.scorers.features import checked_command
+from curation_ros.core.scorers.object_coupling import known, lost_steps, seconds
+from curation_ros.core.scorers.scorer import Scorer
+
+if TYPE_CHECKING:
+    from curation_ros.core.episode import Episode
+
+
+class GripConsistency(Scorer):
+    """Share of the steps of LIFT and TRANSPORT in which the fingers held something.
+
+    For graphs without the pose of an object; evidence of the gripper, not of the object.
+    `on='fingers'`: the gap is neither closed (below 2.5 % of the widest opening so far) nor wider
+    by 5 % of it than at its narrowest since the grasp. `on='effort'`: the efforts of the fingers,
+    the field that `effort` names, still have a fifth of what they had at the grasp, and in its
+    direction; an empty grasp shows only where it is as good as without effort. Two steps in a row
+    make it sure.
+
+    Without these phases in the topic map, the time from half a second after a closing command to
+    the opening counts: then only fingers that close on nothing can be told.
+
+    Abstains without fingers (or effort) in the topic map, and where the episode ends in
+    mid-carry. It looks at the whole episode, whatever the length control.
+    """
+
+    needs = "nothing"
+    length_controlled = False
+    resolution = 0.02
+    choices: ClassVar = {"on": ("fingers", "effort")}
+
+    def __init__(self, *, on: str = "fingers", effort: str = "") -> None:
+        """Store the parameters.
+
+        Args:
+            on: what is read: the gap between the fingers, or their effort.
+            effort: the field with the efforts of the fingers, for `effort`.
+        """
+        self.on = on
+        self.effort = effort
+
+    def check_params(self) -> None:
+        """Check that effort has a field."""
+        super().check_params()
+        if (self.on == "effort") != bool(self.effort):
+            raise ConfigError(
+                f"GripConsistency: on is {self.on!r} and effort {self.effort!r}, expected the "
+                "field of the topic map with the efforts, with on: effort and only then"
+            )
+
+    def score(self, episode: Episode) -> float:
+        """1: held all the way; less: let go or closed on nothing at that share; 0: never held."""
+        return self._grip(episode).coupling
+
+    def location(self, episode: Episode) -> tuple[int, int] | None:
+        """The first step without a grip and the one that makes it sure."""
+        return lost_steps(self._grip(episode))
+
+    def explain(self, episode: Episode) -> str | None:
+        """When and where the fingers held nothing any more."""
+        hold = self._grip(episode).worst
+        if hold is None or hold.departed is None:
+            return None
+        where = f", in {hold.phase}" if hold.phase else ""
+        return (
+            f"the fingers {'had let go' if hold.opened else 'held nothing'} at "
+            f"{seconds(episode, hold.departed):.1f} s{where}, as {hold.object} shows"
+        )
+
+    def _grip(self, episode: Episode) -> Carrying:
+        self.check_params()
+        checked_command(episode)
+        return known(grip_of(episode, effort=self.effort))
