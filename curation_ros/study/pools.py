@@ -10,12 +10,11 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from curation_ros.auditing import AuditSettings, audit, read_episodes, read_labels
-from curation_ros.collecting import Collection, collect
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError, EpisodeError
 from curation_ros.core.scorers import SCORERS
@@ -24,6 +23,9 @@ from curation_ros.core.selection import ranking, tie_key
 from curation_ros.core.stream import Floats
 from curation_ros.dataset import Dataset
 from curation_ros.study.plan import CONTROLS, StudyPlan, Term, parse_row
+
+if TYPE_CHECKING:
+    from curation_ros.collecting import Collection
 
 #: Points that a phase of a trace is resampled to.
 POINTS_PER_PHASE = 8
@@ -86,6 +88,8 @@ def collect_datasets(
         ConfigError: if a start state is used twice among them and the rollouts.
         CurationError: if one of them cannot be completed.
     """
+    from curation_ros.collecting import collect
+
     wanted = {"reference": plan.reference, **plan.pools}
     check_starts(plan)
     made, n_new = {}, 0
@@ -115,10 +119,10 @@ def check_starts(plan: StudyPlan) -> None:
 
     used: dict[str, str] = {}
     for name, settings in {"reference": plan.reference, **plan.pools}.items():
-        for plan_ in _collection(settings, name).plan().values():
-            owner = used.setdefault(plan_.start, name)
+        for episode in _collection(settings, name).plan().values():
+            owner = used.setdefault(episode.start, name)
             if owner != name:
-                raise ConfigError(f"start {plan_.start} is used by {owner} and by {name}")
+                raise ConfigError(f"start {episode.start} is used by {owner} and by {name}")
     kinds: dict[str, str] = {}
     for stage in plan.stages:
         for start in start_names(stage.starts):
@@ -133,6 +137,8 @@ def check_starts(plan: StudyPlan) -> None:
 
 
 def _collection(settings: Any, name: str) -> Collection:
+    from curation_ros.collecting import Collection
+
     try:
         return Collection(**settings)
     except TypeError as err:

@@ -25,6 +25,8 @@ from curation_ros.study.pools import (
 Said = Callable[[str], None]
 #: What is told of a unit that was done: which stage, what kind, how many of how many.
 Ticked = Callable[[str, int, int], None]
+# Training sets that are trained on before they are rolled out.
+_CELLS = 16
 
 
 @dataclass(frozen=True)
@@ -141,8 +143,7 @@ def run_study(
         f"{judge.used_steps} of {plan.budget_steps} simulation steps are used"
     )
     found: list[str] = []
-    for (stage, pool, variant), part in _parts(cells).items() if work else ():
-        label = f"{stage}: {pool}, {variant}"
+    for label, part in _parts(cells) if work else ():
         found += _train(judge, plan, part, label, clock, said, ticked)
         found += _roll(judge, part, label, clock, said, ticked)
     return Study(
@@ -174,13 +175,14 @@ def _cells(plan: StudyPlan, pools: Mapping[str, Pool], reference: Dataset) -> It
             yield Cell(stage, variant, sets)
 
 
-def _parts(cells: tuple[Cell, ...]) -> dict[tuple[str, str, str], list[Cell]]:
-    """Cells of a stage, pool and variant: done together, and timed."""
+def _parts(cells: tuple[Cell, ...]) -> Iterator[tuple[str, list[Cell]]]:
+    """Cells that are trained and then rolled out, and what they are: a run cut short has both."""
     parts: dict[tuple[str, str, str], list[Cell]] = {}
     for cell in cells:
-        key = (cell.stage.name, cell.pool, cell.variant)
-        parts.setdefault(key, []).append(cell)
-    return parts
+        parts.setdefault((cell.stage.name, cell.pool, cell.variant), []).append(cell)
+    for (stage, pool, variant), alike in parts.items():
+        for k in range(0, len(alike), _CELLS):
+            yield f"{stage}: {pool}, {variant}", alike[k : k + _CELLS]
 
 
 def _train(
