@@ -2,13 +2,14 @@
 # make test    checks and tests, as CI runs them
 # make docs    docs/metrics.md anew, from the code
 # make bench   the benchmarks (half an hour)
+# make benchmark   the paper's experiment: collect, score, select, train, roll out, report (an hour)
 # Each makes .venv by itself. A CPU-only torch: make TORCH_BACKEND=cpu demo
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # What is installed; a smaller machine takes less, for instance EXTRAS=ros,test
-EXTRAS ?= ros,sim,policy,test
+EXTRAS ?= ros,sim,policy,report,test
 # Any requirement on torch, for instance TORCH=torch==2.13.0
 TORCH ?=
 ifdef TORCH_BACKEND
@@ -17,7 +18,7 @@ endif
 # Of the extras, so that asking for others installs them.
 READY := $(VENV)/.ready-$(EXTRAS)
 
-.PHONY: setup demo test check bench docs clean
+.PHONY: setup demo test check bench benchmark docs clean
 
 setup: $(READY)
 
@@ -53,6 +54,11 @@ docs: setup
 
 bench: setup
 	$(BIN)/python benchmarks/run.py
+
+# It goes on where it was; another study: make benchmark STUDY=config/question.yaml
+STUDY ?= config/paper.yaml
+benchmark: setup
+	@$(BIN)/curation benchmark --config $(STUDY)
 
 clean:
 	rm -rf $(VENV) build install log *.egg-info .*_cache .hypothesis

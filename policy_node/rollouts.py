@@ -55,13 +55,14 @@ def field_values(observation: Observation) -> dict[str, Floats]:
     }
 
 
-class _SimController:
+class SimController:
     """A policy in the shape that `run_episode` drives; for one episode."""
 
     def __init__(self, policy: Policy) -> None:
         self._controller = PolicyController(policy)
 
     def act(self, observation: Observation, phase_index: int) -> tuple[Floats, float]:
+        """Twist and gripper, as `PolicyController.act` says."""
         return self._controller.act(field_values(observation), phase_index)
 
 
@@ -139,7 +140,7 @@ def rollout(
     result = run_episode(
         env,
         start,
-        _SimController(policy),
+        SimController(policy),
         max_steps=max_steps,
         steps_after_success=0,
         give_up=GiveUp() if gives_up else None,

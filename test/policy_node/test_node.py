@@ -145,7 +145,7 @@ def test_graph_and_one_process_go_the_same_way(graph, answers, folder, request):
     episode_id = next(e.id for e in graph.events if e.event == "ended")
     driven = read_episode(dataset / "episodes" / episode_id)
 
-    from policy_node.rollouts import _SimController
+    from policy_node.rollouts import SimController
     from sim_node.episodes import run_episode
 
     steps = []
@@ -153,7 +153,7 @@ def test_graph_and_one_process_go_the_same_way(graph, answers, folder, request):
         run_episode(
             env,
             parse_starts(START)[0],
-            _SimController(Policy.load(folder)),
+            SimController(Policy.load(folder)),
             max_steps=MAX_STEPS,
             on_step=steps.append,
         )
