@@ -1,0 +1,234 @@
+"""How well the scorers of consequence tell a lost object: clean ones flagged, losses found, delay.
+
+    python benchmarks/consequence.py FOLDER [--json] [--jobs N]
+
+collects, where FOLDER does not have them yet, 220 clean and 220 defective demonstrations (every
+defect of the simulator in turn) on generated starts, without ROS. The constants of the detectors
+were chosen on seed 101 (20 and 20), and on the shape of the paper's data (seeds 11 and 13); the
+figures are those of seeds 102 to 106 (200 and 200). Bounds are Clopper and Pearson's, of 95 %.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curation_ros.bags.reader import read_episode
+from curation_ros.collecting import Collection, collect
+from curation_ros.configuration import topic_map_or_default
+from curation_ros.core.carrying import Carrying, carrying_of
+from curation_ros.core.episode import Episode
+from curation_ros.core.grip import grip_of
+from curation_ros.core.intervals import clopper_pearson
+from curation_ros.core.scorers import SCORERS, Abstain
+from curation_ros.core.stream import NS_PER_S
+from curation_ros.core.topic_map import TopicMap, topic_map_from_json
+from curation_ros.dataset import Dataset
+from sim_node.defects import DEFECTS
+
+CHOSEN_ON, REPORTED = (101,), (102, 103, 104, 105, 106)
+_EPISODES = {101: 40}
+_OTHERWISE = 80
+_MAX_STEPS_DEFECTIVE = 300
+_NOISE_M, _DELAY_S, _DROPOUT = 0.01, 0.1, 0.3
+#: The object has left when it is farther from the effector by this than when it was let go.
+_LEFT_M = 0.005
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a detector says: whether something was lost, None: it does not know; and since when."""
+
+    is_lost: bool | None
+    noticed: int | None = None
+
+
+@dataclass
+class Tally:
+    """Verdicts on many episodes."""
+
+    clean: list[Verdict] = field(default_factory=list)
+    defective: list[Verdict] = field(default_factory=list)
+    delays_ms: list[float] = field(default_factory=list)
+
+
+def collected(
+    folder: Path, seeds: tuple[int, ...], jobs: int
+) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Bags of the episodes of some seeds with their truth, collected where they are missing."""
+    kinds = [name for name in DEFECTS if name != "none"]
+    for seed in seeds:
+        for k, defect in enumerate(kinds):
+            n = _EPISODES.get(seed, _OTHERWISE) // len(kinds)
+            collection = Collection(
+                episodes=n,
+                contamination=0.5,
+                defect=defect,
+                seed=seed,
+                starts=f"generated:{seed}:{k * n}:{(k + 1) * n}",
+                max_steps_defective=_MAX_STEPS_DEFECTIVE,
+            )
+            name = f"seed-{seed}" if k == 0 else f"seed-{seed}-{defect}"
+            path = folder / name
+            for one in collect(path, collection, jobs=jobs):
+                if one.problem or one.truth is None:
+                    raise SystemExit(f"{path}: {one.name}: {one.problem}")
+                yield Dataset(path).bag_path(str(one.truth["episode"])), one.truth
+
+
+def with_effort(topic_map: TopicMap) -> TopicMap:
+    """The map with a field for the efforts of the fingers, which our bags have anyway."""
+    raw = topic_map.to_json()
+    fingers = raw["fields"]["finger_position"]
+    paths = [path.replace("position.", "effort.") for path in fingers["values"]]
+    raw["fields"]["finger_effort"] = {**fingers, "values": paths, "unit": "N"}
+    return topic_map_from_json(raw)
+
+
+def without_phases(episode: Episode) -> Episode:
+    """The same episode of a graph that publishes no phases."""
+    kept = {k: v for k, v in episode.topic_map.fields.items() if v.role != "phase"}
+    return replace(episode, topic_map=replace(episode.topic_map, fields=kept, state=()))
+
+
+def degraded(episode: Episode, rng: np.random.Generator) -> Episode:
+    """The same episode with poses of objects as a poor tracker gives them.
+
+    Noise of 10 mm in each axis, 100 ms late by its stamps, and of 100 poses 30 are missing: as
+    everywhere, the last one is then held.
+    """
+    fields = dict(episode.fields)
+    steps = np.arange(len(episode))
+    late = np.maximum(steps - round(_DELAY_S * episode.rate_hz), 0)
+    for spec in episode.topic_map.with_role("object"):
+        seen = fields[spec.name][late]
+        seen = seen + _NOISE_M * rng.standard_normal(seen.shape)
+        there = rng.random(len(steps)) >= _DROPOUT
+        there[:1] = True
+        fields[spec.name] = seen[np.maximum.accumulate(np.where(there, steps, 0))]
+    return replace(episode, fields=fields)
+
+
+def _of(carrying: Carrying) -> Verdict:
+    worst = carrying.worst
+    if worst is None or worst.state == "unknown":
+        return Verdict(None)
+    return Verdict(worst.state in ("broken", "never"), worst.noticed)
+
+
+def _of_events(episode: Episode) -> Verdict:
+    scorer = SCORERS["phase_events"]()
+    try:
+        is_lost = scorer.score(episode) < 1.0 - scorer.resolution
+        location = scorer.location(episode)
+    except Abstain:
+        return Verdict(None)
+    return Verdict(is_lost, location[0] if location is not None else None)
+
+
+#: What is given -> what a detector makes of an episode.
+DETECTORS: dict[str, Callable[[Episode, np.random.Generator], Verdict]] = {
+    "object, exact pose": lambda e, _: _of(carrying_of(e)),
+    "object, 10 mm noise, 100 ms delay, 30 % dropout": lambda e, rng: _of(
+        carrying_of(degraded(e, rng))
+    ),
+    "no object: gap of the fingers": lambda e, _: _of(grip_of(e)),
+    "no object: effort of the fingers": lambda e, _: _of(grip_of(e, effort="finger_effort")),
+    "no object: commands within phases": lambda e, _: _of_events(e),
+    "object, exact pose, no phases": lambda e, _: _of(carrying_of(without_phases(e))),
+}
+
+
+def left_at(episode: Episode, release_step: int) -> int:
+    """First step at which the object had left the effector, by the exact poses."""
+    away_m = np.linalg.norm(
+        episode.fields["bowl_position"] - episode.fields["eef_position"], axis=1
+    )
+    held_m = float(np.median(away_m[release_step - 10 : release_step + 1]))
+    return release_step + int(np.argmax(away_m[release_step:] > held_m + _LEFT_M))
+
+
+def tallies(folder: Path, seeds: tuple[int, ...], jobs: int) -> dict[str, Tally]:
+    """What each detector says of the episodes of some seeds."""
+    topic_map = with_effort(topic_map_or_default(""))
+    found = {name: Tally() for name in DETECTORS}
+    for path, truth in collected(folder, seeds, jobs):
+        episode = read_episode(path, topic_map)
+        for name, detector in DETECTORS.items():
+            rng = np.random.default_rng(zlib.crc32(f"{truth['start']} {truth['name']}".encode()))
+            verdict = detector(episode, rng)
+            tally = found[name]
+            if truth["defect"] == "none":
+                tally.clean.append(verdict)
+                continue
+            tally.defective.append(verdict)
+            if verdict.is_lost and verdict.noticed is not None:
+                step = left_at(episode, int(truth["release_step"]))
+                late_ns = episode.stamps_ns[verdict.noticed] - episode.stamps_ns[step]
+                tally.delays_ms.append(1000.0 * float(late_ns) / NS_PER_S)
+    return found
+
+
+def row(name: str, tally: Tally, seeds: tuple[int, ...]) -> dict[str, Any]:
+    """A line of the report."""
+    flagged = sum(v.is_lost is True for v in tally.clean)
+    found = sum(v.is_lost is True for v in tally.defective)
+    return {
+        "input": name,
+        "seeds": list(seeds),
+        "clean": len(tally.clean),
+        "clean_flagged": flagged,
+        "clean_flagged_at_most": clopper_pearson(flagged, len(tally.clean))[1],
+        "clean_unknown": sum(v.is_lost is None for v in tally.clean),
+        "defective": len(tally.defective),
+        "found": found,
+        "found_at_least": clopper_pearson(found, len(tally.defective))[0],
+        "defective_unknown": sum(v.is_lost is None for v in tally.defective),
+        "delay_ms_median": statistics.median(tally.delays_ms) if tally.delays_ms else None,
+        "delay_ms_worst": max(tally.delays_ms, default=None),
+        "within_300_ms": sum(d <= 300.0 for d in tally.delays_ms),
+    }
+
+
+def text(line: dict[str, Any]) -> str:
+    """A line for people."""
+    out = (
+        f"{line['input']}: clean flagged {line['clean_flagged']} of {line['clean']} "
+        f"(at most {line['clean_flagged_at_most']:.1%}), unknown {line['clean_unknown']}; "
+        f"found {line['found']} of {line['defective']} (at least {line['found_at_least']:.1%}), "
+        f"unknown {line['defective_unknown']}"
+    )
+    if line["delay_ms_median"] is None:
+        return out
+    return (
+        f"{out}; delay {line['delay_ms_median']:.0f} ms median, {line['delay_ms_worst']:.0f} ms "
+        f"worst, {line['within_300_ms']} within 300 ms"
+    )
+
+
+def main() -> int:
+    """Collect what is missing, and report."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    parser.add_argument("--json", action="store_true", help="a JSON line a row")
+    parser.add_argument("--jobs", type=int, default=2, help="simulators at once")
+    args = parser.parse_args()
+    for title, seeds in (("chosen on", CHOSEN_ON), ("reported", REPORTED)):
+        if not args.json:
+            print(f"{title}: seeds {', '.join(map(str, seeds))}", flush=True)
+        for name, tally in tallies(args.folder, seeds, args.jobs).items():
+            line = row(name, tally, seeds)
+            print(json.dumps(line) if args.json else f"  {text(line)}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
