@@ -116,7 +116,7 @@ def _claims(found: Row) -> Iterator[str]:
 
 def _looks(found: Row) -> Iterator[str]:
     """How many scorers are of use, by the rows that cost no more."""
-    for stage in stages(found, "screen"):
+    for stage in stages(found, "protocol", "screen"):
         judged = [r for r in stage["rows"] if r["rival"] is not None]
         if not judged:
             yield f"Stage {stage['name']} has no outcomes of scorers yet."
@@ -136,7 +136,10 @@ def _looks(found: Row) -> Iterator[str]:
 
 
 def _look(stage: Row) -> str:
-    return " (a look, not a claim)" if stage["kind"] == "screen" else ""
+    """What a sentence about a stage that confirms nothing says of itself."""
+    if stage["kind"] == "screen":
+        return " (a look, not a claim)"
+    return f" ({len(stage['seeds'])} training seeds)"
 
 
 def _places(n: int) -> str:

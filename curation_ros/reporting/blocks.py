@@ -29,13 +29,13 @@ class Table:
         caption: what it shows, in a line or two.
         headings: of the columns.
         rows: texts, as many in each as there are headings.
-        n_text: the first so many columns hold words and stand left, the others figures.
+        text: numbers of the columns that hold words and stand left; the others hold figures.
     """
 
     caption: str
     headings: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    n_text: int = 1
+    text: tuple[int, ...] = (0,)
 
 
 @dataclass(frozen=True)

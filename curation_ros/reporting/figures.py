@@ -124,13 +124,20 @@ def style(scorer: str) -> dict[str, Any]:
     return {"color": color, "marker": marker, "markerfacecolor": face}
 
 
+def _of(stage: Row) -> str:
+    """Name and kind of a stage, once where they are the same."""
+    return (
+        stage["name"] if stage["kind"] in stage["name"] else f"{stage['name']} ({stage['kind']})"
+    )
+
+
 def spoken(name: str) -> str:
     """A name as people read it."""
     return name.replace("_", " ")
 
 
 def detection_panel(
-    found: Row, pool: str, variant: str, rows: Sequence[Row], keep: int
+    stage: Row, pool: str, variant: str, rows: Sequence[Row], keep: int
 ) -> Drawing:
     """AUROC against success, a point a scorer at one number kept."""
     points = [r for r in at_keep(rows, keep) if r["rate"] is not None and r["auroc"] is not None]
@@ -155,11 +162,12 @@ def detection_panel(
             )
             seeds = [c["successes"] / c["n"] for c in row["counts"]]
             axes.plot([x] * len(seeds), seeds, ".", color=look["color"], alpha=0.6, markersize=5)
-        _detection_axes(axes, f"{pool}, {variant}: {keep} kept")
+        _detection_axes(axes, f"{_of(stage)}: {pool}, {variant}, {keep} kept")
         _legend(canvas, axes, 3)
 
-    alt = f"AUROC against success, pool {pool}, observations {variant}, {keep} kept: " + ", ".join(
-        f"{spoken(r['scorer'])} {r['auroc']:.2f}, {r['rate']:.0%}" for r in points
+    alt = (
+        f"AUROC against success, {_of(stage)}, pool {pool}, observations {variant}, {keep} kept: "
+        + ", ".join(f"{spoken(r['scorer'])} {r['auroc']:.2f}, {r['rate']:.0%}" for r in points)
     )
     return Drawing(draw, alt)
 
@@ -200,7 +208,7 @@ def published_panel() -> Drawing:
 def _detection_axes(axes: Axes, title: str) -> None:
     axes.axvline(0.5, color="#dddddd", linewidth=0.8, zorder=0)
     axes.set_xlim(-0.03, 1.03)
-    axes.set_xlabel("AUROC, length controlled")
+    axes.set_xlabel("AUROC of the score")
     _success_axis(axes)
     axes.set_title(title, loc="left")
 
@@ -245,7 +253,7 @@ def keep_panel(found: Row, pool: str, variant: str, rows: Sequence[Row], scorer:
     return Drawing(draw, alt, (4.2, 4.4))
 
 
-def control_panel(pool: str, variant: str, rows: Sequence[Row]) -> Drawing:
+def control_panel(stage: Row, pool: str, variant: str, rows: Sequence[Row]) -> Drawing:
     """Success of the sets that no scorer makes, against how many are kept."""
 
     def draw(canvas: FigureBase) -> None:
@@ -253,15 +261,20 @@ def control_panel(pool: str, variant: str, rows: Sequence[Row]) -> Drawing:
         _lines(axes, rows)
         looks = {"oracle": ("--", "o"), "shuffled": ("-", "s"), "worst": ("-", "v")}
         colors = {"oracle": _DARK, "shuffled": "#CC79A7", "worst": "#D55E00"}
-        for name, (line, marker) in looks.items():
-            found = [r for some in draws(rows, name).values() for r in some]
+        for k, (name, (line, marker)) in enumerate(looks.items(), -1):
+            # Side by side: intervals that lie upon each other cannot be read.
+            found = [
+                {**r, "keep": keep + 0.5 * k}
+                for keep, some in draws(rows, name).items()
+                for r in some
+            ]
             done = [r for r in found if r["rate"] is not None]
             look = {"color": colors[name], "marker": marker, "markerfacecolor": "white"}
             _with_intervals(axes, done, f"{name} @ K", look, line)
         _curve(axes, draws(rows, "random"), "random @ K", color=_GREY, linestyle="-", band=True)
         _success_axis(axes)
         axes.set_xlabel("number kept")
-        axes.set_title(f"controls ({pool}, {variant})", loc="left")
+        axes.set_title(f"{_of(stage)}: controls ({pool}, {variant})", loc="left")
         _legend(canvas, axes, 2)
 
     alt = f"success of the controls by number kept, {pool}, {variant}"
@@ -315,7 +328,13 @@ def contrast_panel(stage: Row) -> Drawing:
         for k, one in enumerate(planned):
             name = f"{one['a']} minus {one['b']} ({one['pool']}, {one['variant']})"
             value = one.get("value")
-            axes.text(-1, k - 0.3, name if value is not None else f"{name}: no data", fontsize=8)
+            axes.text(
+                -1,
+                k - 0.3,
+                name if value is not None else f"{name}: no data",
+                fontsize=8,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
+            )
             if value is None:
                 continue
             p = one["p_holm"]
@@ -384,8 +403,8 @@ def _phase_axis(axes: Axes, traces: Sequence[Row]) -> None:
         rotation_mode="anchor",
         fontsize=8,
     )
-    axes.tick_params(axis="x", length=0)
-    for above in (axes, *axes.get_shared_x_axes().get_siblings(axes)):
+    for above in axes.get_shared_x_axes().get_siblings(axes):
+        above.tick_params(axis="x", length=0)
         for k in range(1, len(PHASES)):
             above.axvline(width * k - 0.5, color="#e4e4e4", linewidth=0.6, zorder=0)
 

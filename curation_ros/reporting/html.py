@@ -20,9 +20,10 @@ main { max-width: 1240px; margin: 0 auto; padding: 1rem; }
 h1 { font-size: 1.6rem; margin: 0.5rem 0 0; }
 h2 { font-size: 1.2rem; margin: 2.2rem 0 0.6rem; border-bottom: 1px solid var(--line); }
 .question { font-size: 1.1rem; margin: 0.2rem 0 1rem; }
-p, li, nav { max-width: 80ch; }
+p, li { max-width: 80ch; }
+.caption { font-size: 0.875rem; line-height: 1.4; max-width: 120ch; margin: 0.8rem 0 0.3rem; }
 li { margin: 0.25rem 0; overflow-wrap: anywhere; }
-nav ol { margin: 0; padding-left: 1.4rem; columns: 20rem 2; }
+nav ol { margin: 0; padding-left: 1.4rem; columns: 22rem 2; }
 a { color: var(--link); }
 .warning { color: var(--warn); background: var(--warn-soft); padding: 0.4rem 0.7rem;
   border-left: 4px solid var(--warn); }
@@ -32,8 +33,9 @@ figure { margin: 1rem 0 1.5rem; }
 .panels > div { background: #fff; border: 1px solid var(--line); border-radius: 4px;
   padding: 0.3rem; }
 .panels svg { display: block; width: 100%; height: auto; max-width: 600px; margin: 0 auto; }
-figcaption, caption { font-size: 0.875rem; text-align: left; color: inherit; margin: 0.4rem 0; }
-.wide { overflow: auto; max-height: 80vh; border: 1px solid var(--line); border-radius: 4px;
+figcaption { font-size: 0.875rem; text-align: left; color: inherit; margin: 0.4rem 0; }
+.wide { overflow: auto; max-height: 80vh; width: fit-content; max-width: 100%;
+  border: 1px solid var(--line); border-radius: 4px;
   margin: 0.3rem 0 1.5rem; }
 table { border-collapse: separate; border-spacing: 0; font-size: 0.84rem;
   font-variant-numeric: tabular-nums; }
@@ -41,11 +43,11 @@ th, td { padding: 0.25rem 0.6rem; border-bottom: 1px solid var(--line); text-ali
   white-space: nowrap; vertical-align: top; }
 th.text, td.text { text-align: left; }
 td.text.long { white-space: normal; min-width: 18rem; }
-thead th { position: sticky; top: 0; background: var(--soft); z-index: 2; vertical-align: bottom; }
+thead th { position: sticky; top: 0; background: var(--soft); z-index: 2; vertical-align: bottom;
+  white-space: normal; }
 tbody th { position: sticky; left: 0; background: var(--soft); font-weight: 600; z-index: 1; }
 thead th:first-child { left: 0; z-index: 3; }
-@media (max-width: 600px) { main { padding: 0.6rem; } tbody th { max-width: 40vw;
-  white-space: normal; overflow-wrap: anywhere; } }
+@media (max-width: 600px) { main { padding: 0.6rem; } tbody th { white-space: normal; } }
 @media print { .wide { max-height: none; overflow: visible; border: 0; } body { font-size: 10pt; }
   table { font-size: 6.5pt; } th, td { white-space: normal; padding: 0.1rem 0.2rem; }
   figure, tr { break-inside: avoid; } nav { display: none; } }
@@ -105,22 +107,24 @@ def _block(block: Block) -> str:
 
 def _table(table: Table) -> str:
     head = "".join(
-        f'<th scope="col"{_side(k < table.n_text)}>{escape(h)}</th>'
+        f'<th scope="col"{_side(k in table.text)}>{escape(h)}</th>'
         for k, h in enumerate(table.headings)
     )
-    rows = "".join(f"<tr>{_cells(row, table.n_text)}</tr>\n" for row in table.rows)
+    rows = "".join(f"<tr>{_cells(row, table.text)}</tr>\n" for row in table.rows)
     # The caption stands outside, so that it does not scroll away with a wide table.
     return (
-        f'<p class="caption"><small>{escape(table.caption)}</small></p>\n'
+        f'<p class="caption">{escape(table.caption)}</p>\n'
         f'<div class="wide" tabindex="0"><table><thead><tr>{head}</tr></thead>\n'
         f"<tbody>\n{rows}</tbody></table></div>"
     )
 
 
-def _cells(row: tuple[str, ...], n_text: int) -> str:
-    first = f'<th scope="row" class="text">{escape(row[0])}</th>'
+def _cells(row: tuple[str, ...], text: tuple[int, ...]) -> str:
+    # Where a long name of a row may be broken on a narrow screen.
+    name = escape(row[0]).replace("_", "_<wbr>")
+    first = f'<th scope="row" class="text">{name}</th>'
     return first + "".join(
-        f"<td{_side(k < n_text, len(cell) > _LONG)}>{escape(cell)}</td>"
+        f"<td{_side(k in text, len(cell) > _LONG)}>{escape(cell)}</td>"
         for k, cell in enumerate(row[1:], 1)
     )
 

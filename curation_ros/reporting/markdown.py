@@ -35,7 +35,7 @@ def _block(block: Block) -> str:
 
 
 def _table(table: Table) -> str:
-    sides = [":--" if k < table.n_text else "--:" for k in range(len(table.headings))]
+    sides = [":--" if k in table.text else "--:" for k in range(len(table.headings))]
     rows = [table.headings, sides, *table.rows]
     return _plain(table.caption) + "\n\n" + "\n".join(_line(row) for row in rows)
 

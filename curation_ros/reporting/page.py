@@ -13,7 +13,6 @@ from curation_ros.reporting.findings import (
     groups,
     is_plain,
     is_sweep,
-    keep_counts,
     main_keep,
     stages,
 )
@@ -66,7 +65,7 @@ def _detection(found: Row) -> Iterator[Block]:
             done = [r for r in at_keep(rows, keep) if r["rate"] is not None]
             # A stage of contrasts has one or two scorers: nothing to lay out.
             if keep is not None and len(done) >= 3:
-                drawings.append(figures.detection_panel(found, pool, variant, rows, keep))
+                drawings.append(figures.detection_panel(stage, pool, variant, rows, keep))
                 kinds.add(stage["kind"])
     if "screen" in kinds:
         yield Text(_SCREEN)
@@ -75,19 +74,19 @@ def _detection(found: Row) -> Iterator[Block]:
         drawings = []
     yield figures.figure(
         "figure-main",
-        "AUROC (length controlled) against success. Bars: 95 % intervals, of success over "
+        "AUROC against success. The AUROC is of the score that ranks: with length controlled, but "
+        "for length itself. Bars: 95 % intervals, of success over "
         "training seeds and starts; dots: the policy of each training seed. The paper's points "
         "with its standard deviations stand last. A scorer that needs no fit on the reference has "
         "an open marker.",
         [*drawings, figures.published_panel()],
     )
     for stage in found["stages"]:
-        table = tables.correlations(stage)
+        keeps = {main_keep(found, pool, rows) for pool, _, rows in groups(stage)}
+        table = tables.correlations(stage, keeps)
         if table:
             yield table
-        elif any(
-            len(at_keep(rows, k)) >= 3 for _, _, rows in groups(stage) for k in keep_counts(rows)
-        ):
+        elif any(len(at_keep(rows, k)) >= 3 for _, _, rows in groups(stage) for k in keeps):
             yield _missing(f"stage {stage['name']} has no rank correlation yet.")
 
 
@@ -102,15 +101,7 @@ def _conditions(found: Row) -> Iterator[Block]:
             yield _missing(f"{stage['missing']} outcomes of stage {stage['name']}.")
     if shown:
         yield Text(published.NOTE)
-        yield Points(
-            tuple(
-                f"{figures.spoken(name)}: the paper's policy was trained on {one.clean_kept} "
-                f"of the 20 demonstrations called clean; its own scores, joined by name, would "
-                f"have kept {one.clean_kept_joined}"
-                for name, one in published.TABLE_2.items()
-                if one.clean_kept is not None
-            )
-        )
+        yield tables.published_kept()
 
 
 def _keep_counts(found: Row) -> Iterator[Block]:
@@ -130,16 +121,19 @@ def _keep_counts(found: Row) -> Iterator[Block]:
         ):
             yield tables.best_cells(stage)
             yield tables.baselines(stage)
+            table = tables.correlations(stage)
+            if table:
+                yield table
     if not any_sweep:
         yield Text("This study keeps fewer than three different numbers: there is no curve.")
-    table = tables.purity(found)
-    if table:
-        yield table
+    ceilings = tables.purity(found)
+    if ceilings:
+        yield ceilings
 
 
 def _sweep(found: Row, stage: Row, pool: str, variant: str, rows: Sequence[Row]) -> Figure:
     scorers = dict.fromkeys(r["scorer"] for r in rows if is_plain(r))
-    drawings = [figures.control_panel(pool, variant, rows)]
+    drawings = [figures.control_panel(stage, pool, variant, rows)]
     drawings += [figures.keep_panel(found, pool, variant, rows, scorer) for scorer in scorers]
     return figures.figure(
         f"figure-keep-{_safe(stage['name'])}-{_safe(pool)}-{_safe(variant)}",
@@ -227,6 +221,10 @@ def _method(found: Row) -> Iterator[Block]:
         yield Points(tuple(str(p) for p in found["problems"]))
     else:
         yield Text("No problem was reported: nothing failed, nothing was refused by the budget.")
+    yield Text(
+        "Every figure here, the paper's excepted, stands in results.json, with the outcome of "
+        "every rollout and the plan."
+    )
     yield Text(_PHASES)
     yield Table(
         "Observations of the policies.",
@@ -235,7 +233,7 @@ def _method(found: Row) -> Iterator[Block]:
             (v, _VARIANTS.get(v, tables.NOTHING))
             for v in dict.fromkeys(v for s in found["stages"] for v in s["variants"])
         ),
-        n_text=2,
+        text=(0, 1),
     )
     yield Table(
         "Stages. The same training seeds and starts for every training set of a stage; the "
@@ -253,7 +251,7 @@ def _method(found: Row) -> Iterator[Block]:
             )
             for s in found["stages"]
         ),
-        n_text=6,
+        text=(0, 1, 2, 3, 4, 5),
     )
     yield _demonstrations(found)
     yield _scorer_needs(found)
@@ -291,7 +289,7 @@ def _demonstrations(found: Row) -> Table:
         "Demonstrations of the scripted expert.",
         ("dataset", "collected with", "n", "good", "steps", "release at step"),
         tuple(rows),
-        n_text=2,
+        text=(0, 1),
     )
 
 
@@ -310,7 +308,7 @@ def _scorer_needs(found: Row) -> Table:
             )
             for scorer in scorers
         ),
-        n_text=1 + len(found["pools"]),
+        text=tuple(range(1 + len(found["pools"]))),
     )
 
 

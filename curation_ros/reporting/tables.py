@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from curation_ros.reporting import published
@@ -114,15 +114,13 @@ def table_1(found: Row, pool: str) -> Table:
             (
                 row["scorer"],
                 needs(facts["needs"].get(row["scorer"], [row["needs"]])),
-                number(row["auroc_raw"]),
-                span(row["ci_raw"]),
-                number(row["auroc_controlled"]),
-                span(row["ci"]),
-                number(row.get("precision")),
-                number(row.get("clean_recall")),
+                _with_span(row["auroc_raw"], row["ci_raw"]),
                 number(paper.get("raw")),
+                _with_span(row["auroc_controlled"], row["ci"]),
                 number(paper.get("truncated")),
                 number(paper.get("truncated_joined_by_name")),
+                number(row.get("precision")),
+                number(row.get("clean_recall")),
             )
         )
     kept = next((row["keep"] for row in facts["audit"]), None)
@@ -131,12 +129,16 @@ def table_1(found: Row, pool: str) -> Table:
         f"length control {control['mode']}{of} (needs {control['needs']}). Intervals are 95 %. "
         f"Precision and recall: of the best {kept}.",
         (
-            "scorer", "needs", "AUROC raw", "interval", "AUROC controlled", "interval",
-            "precision", "clean recall", "paper raw", "paper T = 324", "paper joined",
+            "scorer", "needs", "AUROC raw", "paper raw", "AUROC controlled", "paper T = 324",
+            "paper joined", "precision", "clean recall",
         ),
         tuple(rows),
-        n_text=2,
+        text=(0, 1),
     )  # fmt: skip
+
+
+def _with_span(value: float | None, bounds: Sequence[float] | None) -> str:
+    return NOTHING if value is None else f"{number(value)} {span(bounds)}"
 
 
 def table_2(found: Row, stage: Row, pool: str) -> Table:
@@ -144,63 +146,62 @@ def table_2(found: Row, stage: Row, pool: str) -> Table:
     parts = {variant: rows for p, variant, rows in groups(stage) if p == pool}
     first = next(iter(parts.values()))
     keep = main_keep(found, pool, first)
-    is_paper = stage["kind"] == "protocol" and keep == published.KEEP
     names = [r["row"] for r in at_keep(first, keep)]
-    if is_paper:
-        order = [f"{name}@{keep}" for name in published.TABLE_2]
-        names.sort(key=lambda n: order.index(n) if n in order else len(order))
-    baselines = [n for n in ("oracle", "reference") if named(first, n)]
-    names = [*baselines, *names, *(n for n in ("everything",) if named(first, n))]
-    headings = ["condition", "needs", "good", "AUROC"]
-    for variant in parts:
-        headings += [f"{variant}: success", "interval", "gap closed", "seeds"]
-    if is_paper:
-        headings += ["paper AUROC", "joined", "paper success", "paper gap"]
+    order = [f"{name}@{keep}" for name in published.TABLE_2]
+    names.sort(key=lambda n: order.index(n) if n in order else len(order))
+    names = [*_there(first, "oracle", "reference"), *names, *_there(first, "everything")]
+    headings = [
+        *("condition", "needs", "good", "AUROC", "paper AUROC", "paper joined"),
+        *(f"{v}: success" for v in parts),
+        "paper success",
+        *(f"{v}: gap closed" for v in parts),
+        "paper gap closed",
+        *(f"{v}: {what}" for v in parts for what in ("interval", "seeds")),
+    ]
     rows = []
     for name in names:
-        some = {variant: named(rows_, name) for variant, rows_ in parts.items()}
-        one = next(row for row in some.values() if row is not None)
+        some = [named(those, name) or {} for those in parts.values()]
+        one = next(row for row in some if row)
+        paper = published.TABLE_2.get(one["scorer"] or one["row"])
         cells = [name, needs(one["needs"]), good_of(one), number(one["auroc"])]
-        for row in some.values():
-            cells += _judged(row)
-        if is_paper:
-            cells += _published(one)
+        cells += [number(paper.auroc if paper else None), number(paper.joined if paper else None)]
+        cells += [rate_with_deviation(r.get("rate"), r.get("sd_population")) for r in some]
+        cells += [rate_with_deviation(paper.success, paper.sd) if paper else NOTHING]
+        cells += [percent(r.get("gap_closed")) for r in some]
+        cells += [f"{100 * paper.gap_closed:.0f} %" if paper else NOTHING]
+        for row in some:
+            cells += [percent_span(row.get("interval")), counts(row) if row else NOTHING]
         rows.append(tuple(cells))
     return Table(
         f"Stage {stage['name']} ({stage['kind']}), pool {pool}: success in per cent, mean ± "
         "population standard deviation over training seeds (as the paper has it), 95 % interval "
-        "over seeds and starts; successes of each seed's policy.",
+        "over seeds and starts, successes of each seed's policy.",
         tuple(headings),
         tuple(rows),
-        n_text=2,
+        text=(0, 1),
     )
 
 
-def _judged(row: Row | None) -> list[str]:
-    if row is None:
-        return [NOTHING] * 4
-    return [
-        rate_with_deviation(row["rate"], row["sd_population"]),
-        percent_span(row["interval"]),
-        percent(row["gap_closed"]),
-        counts(row),
-    ]
+def _there(rows: Sequence[Row], *names: str) -> list[str]:
+    return [name for name in names if named(rows, name)]
 
 
-def _published(row: Row) -> list[str]:
-    one = published.TABLE_2.get(row["scorer"] or row["row"])
-    if one is None:
-        return [NOTHING] * 4
-    return [
-        number(one.auroc),
-        number(one.joined),
-        rate_with_deviation(one.success, one.sd),
-        f"{100 * one.gap_closed:.0f} %",
-    ]
+def published_kept() -> Table:
+    """What the paper's policies were trained on, and what they would have been."""
+    return Table(
+        f"The {published.KEEP} demonstrations that the paper's policies were trained on: how many "
+        "of the 20 that its files call clean.",
+        ("scorer", "clean kept, as run", "clean kept, joined by name"),
+        tuple(
+            (name, str(one.clean_kept), str(one.clean_kept_joined))
+            for name, one in published.TABLE_2.items()
+            if one.clean_kept is not None
+        ),
+    )
 
 
-def correlations(stage: Row) -> Table | None:
-    """Detection against success over the scorers."""
+def correlations(stage: Row, keeps: Collection[int | None] = ()) -> Table | None:
+    """Detection against success over the scorers, at these numbers kept or at all."""
     rows = [
         (
             one["pool"],
@@ -214,6 +215,7 @@ def correlations(stage: Row) -> Table | None:
             {True: "exact", False: "drawn", None: NOTHING}[one["is_exact"]],
         )
         for one in stage["correlations"]
+        if not keeps or one["keep"] in keeps
     ]
     if not rows:
         return None
@@ -235,7 +237,7 @@ def correlations(stage: Row) -> Table | None:
         "one number kept, with its 95 % interval and permutation p.",
         ("pool", "observations", "of", "kept", "scorers", "rho", "interval", "p", "p is"),
         tuple(rows),
-        n_text=3,
+        text=(0, 1, 2),
     )
 
 
@@ -248,7 +250,6 @@ def contrasts(stage: Row) -> Table:
             (
                 f"{one['a']} minus {one['b']}",
                 f"{one['pool']}, {one['variant']}",
-                one["why"] + (" (equal sets)" if one.get("is_same_set") else ""),
                 points(one["value"]) if made else "no data",
                 percent_span(one["interval"]) if made else NOTHING,
                 probability(one["p"]) if made else NOTHING,
@@ -258,6 +259,7 @@ def contrasts(stage: Row) -> Table:
                 str(one["n_starts"]) if made else NOTHING,
                 str(one["n_unpaired"]) if made else NOTHING,
                 number(_hundred(one["minimum_detectable"]), 1) if made else NOTHING,
+                one["why"] + (" (equal sets)" if one.get("is_same_set") else ""),
             )
         )
     return Table(
@@ -266,11 +268,11 @@ def contrasts(stage: Row) -> Table:
         "smallest p that so many seeds can give; detectable is the smallest difference that "
         "would have been found four times in five.",
         (
-            "contrast", "where", "question", "difference", "interval", "p", "p (Holm)", "floor",
-            "seeds", "starts", "unpaired", "detectable",
+            "contrast", "where", "difference", "interval", "p", "p (Holm)", "floor", "seeds",
+            "starts", "unpaired", "detectable", "question",
         ),
         tuple(rows),
-        n_text=3,
+        text=(0, 1, 11),
     )  # fmt: skip
 
 
@@ -314,7 +316,7 @@ def all_rows(stage: Row) -> Table:
             "tied at cut", "missing",
         ),
         tuple(rows),
-        n_text=3,
+        text=(0, 1, 2),
     )  # fmt: skip
 
 
@@ -337,7 +339,7 @@ def baselines(stage: Row) -> Table:
             )
             for row in rows
         ),
-        n_text=3,
+        text=(0, 1, 2),
     )
 
 
@@ -369,7 +371,7 @@ def best_cells(stage: Row) -> Table:
         "Chosen after looking, so these are too good: a look, not a claim.",
         ("row", "where", "needs", "good", "AUROC", "success", "interval", "rival"),
         tuple(rows),
-        n_text=3,
+        text=(0, 1, 2),
     )
 
 
@@ -391,7 +393,7 @@ def purity(found: Row) -> Table | None:
 
 def mapping(caption: str, found: Mapping[str, Any]) -> Table:
     """Keys and values."""
-    return Table(caption, ("", ""), tuple((k, str(v)) for k, v in found.items()), n_text=2)
+    return Table(caption, ("", ""), tuple((k, str(v)) for k, v in found.items()), text=(0, 1))
 
 
 def wall_times(found: Row) -> Table | None:
@@ -412,5 +414,5 @@ def wall_times(found: Row) -> Table | None:
         "Wall time of each part of each run.",
         ("what", "part", "units", "simulation steps", "seconds"),
         tuple(rows),
-        n_text=2,
+        text=(0, 1),
     )
