@@ -113,7 +113,8 @@ def _by_gap(width: Floats, hold: Hold, before: int) -> Hold:
     if not seen[hold.first :].any():
         return replace(hold, state="unknown", reason=f"no value of {hold.object}")
     opening = np.fmax.accumulate(width[: hold.last + 1])[part]
-    narrowest = np.fmin.accumulate(gap)
+    # The wider of two in a row: one wild value does not set what is narrow.
+    narrowest = np.fmin.accumulate(np.fmax(gap, np.concatenate([gap[:1], gap[:-1]])))
     with np.errstate(invalid="ignore"):
         lost = (gap < EMPTY_SHARE * opening) | (gap - narrowest > APART_SHARE * opening)
     decided = _decided(hold, lost[skipped:])
