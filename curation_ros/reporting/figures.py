@@ -220,7 +220,9 @@ def _success_axis(axes: Axes) -> None:
     axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
 
 
-def keep_panel(found: Row, pool: str, variant: str, rows: Sequence[Row], scorer: str) -> Drawing:
+def keep_panel(
+    found: Row, stage: Row, pool: str, variant: str, rows: Sequence[Row], scorer: str
+) -> Drawing:
     """Success and purity of what one scorer keeps, against how many it keeps."""
     curve = sorted(
         (r for r in rows if is_plain(r) and r["scorer"] == scorer), key=lambda r: r["keep"]
@@ -234,7 +236,7 @@ def keep_panel(found: Row, pool: str, variant: str, rows: Sequence[Row], scorer:
         _curve(upper, draws(rows, "oracle"), "oracle @ K", color=_DARK, linestyle="--")
         _curve(upper, draws(rows, "random"), "random @ K", color=_GREY, linestyle="-", band=True)
         _with_intervals(upper, done, spoken(scorer), look)
-        upper.set_title(f"{spoken(scorer)} ({pool}, {variant})", loc="left")
+        upper.set_title(f"{spoken(scorer)}\n{_of(stage)}: {pool}, {variant}", loc="left")
         _success_axis(upper)
         ceiling = found["pools"][pool]["purity_ceiling"]
         xs = sorted(int(k) for k in ceiling)
@@ -274,7 +276,7 @@ def control_panel(stage: Row, pool: str, variant: str, rows: Sequence[Row]) -> D
         _curve(axes, draws(rows, "random"), "random @ K", color=_GREY, linestyle="-", band=True)
         _success_axis(axes)
         axes.set_xlabel("number kept")
-        axes.set_title(f"{_of(stage)}: controls ({pool}, {variant})", loc="left")
+        axes.set_title(f"controls\n{_of(stage)}: {pool}, {variant}", loc="left")
         _legend(canvas, axes, 2)
 
     alt = f"success of the controls by number kept, {pool}, {variant}"

@@ -46,8 +46,10 @@ td.text.long { white-space: normal; min-width: 18rem; }
 thead th { position: sticky; top: 0; background: var(--soft); z-index: 2; vertical-align: bottom;
   white-space: normal; }
 tbody th { position: sticky; left: 0; background: var(--soft); font-weight: 600; z-index: 1; }
+tbody th wbr { display: none; }
 thead th:first-child { left: 0; z-index: 3; }
-@media (max-width: 600px) { main { padding: 0.6rem; } tbody th { white-space: normal; } }
+@media (max-width: 600px) { main { padding: 0.6rem; } tbody th { white-space: normal; }
+  tbody th wbr { display: inline; } }
 @media print { .wide { max-height: none; overflow: visible; border: 0; } body { font-size: 10pt; }
   table { font-size: 6.5pt; } th, td { white-space: normal; padding: 0.1rem 0.2rem; }
   figure, tr { break-inside: avoid; } nav { display: none; } }

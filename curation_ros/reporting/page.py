@@ -134,7 +134,9 @@ def _keep_counts(found: Row) -> Iterator[Block]:
 def _sweep(found: Row, stage: Row, pool: str, variant: str, rows: Sequence[Row]) -> Figure:
     scorers = dict.fromkeys(r["scorer"] for r in rows if is_plain(r))
     drawings = [figures.control_panel(stage, pool, variant, rows)]
-    drawings += [figures.keep_panel(found, pool, variant, rows, scorer) for scorer in scorers]
+    drawings += [
+        figures.keep_panel(found, stage, pool, variant, rows, scorer) for scorer in scorers
+    ]
     return figures.figure(
         f"figure-keep-{_safe(stage['name'])}-{_safe(pool)}-{_safe(variant)}",
         f"Stage {stage['name']} ({stage['kind']}): success against the number kept. Bars: 95 % "
@@ -220,7 +222,7 @@ def _method(found: Row) -> Iterator[Block]:
         yield _missing(f"{len(found['problems'])} problems:")
         yield Points(tuple(str(p) for p in found["problems"]))
     else:
-        yield Text("No problem was reported: nothing failed, nothing was refused by the budget.")
+        yield Text("The last run reported no problem.")
     yield Text(
         "Every figure here, the paper's excepted, stands in results.json, with the outcome of "
         "every rollout and the plan."
