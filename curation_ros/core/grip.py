@@ -121,7 +121,7 @@ def _by_gap(width: Floats, hold: Hold, before: int) -> Hold:
     if decided.noticed is None:
         return decided
     at = decided.noticed - before
-    return replace(decided, gap_m=float(gap[at] - narrowest[at]))
+    return replace(decided, gap_m=max(0.0, float(gap[at] - narrowest[at])))
 
 
 def _by_effort(effort: Floats, hold: Hold, before: int) -> Hold:
