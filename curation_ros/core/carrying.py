@@ -48,9 +48,9 @@ GRASP_S = 0.6
 #: Changes of the pose in the approach that tell how noisy it is; with fewer, what is assumed;
 #: unless it never changes in so many steps.
 _MIN_NOISE_STEPS, _MIN_STILL_STEPS, _ASSUMED_NOISE_M = 8, 20, 0.01
-#: Part of the way to the present distance that the reference goes in a step, and the most: it
-#: follows an object that settles in the fingers, and never one that leaves them.
-_FOLLOW, _FOLLOW_M, _FOLLOW_NOISES = 0.1, 0.002, 1.0
+#: The reference goes to the present distance within this time, if that is no farther than so much:
+#: it follows an object that settles in the fingers, and never one that leaves them.
+_FOLLOW_S, _FOLLOW_M, _FOLLOW_NOISES = 0.5, 0.002, 1.0
 #: The test: growth of the distance below the allowance is none; beyond it, it adds up, no step
 #: by more than a share of the threshold, so that one wild sample is never enough.
 _ALLOWED_M, _ALLOWED_NOISES = 0.015, 0.5
@@ -412,12 +412,13 @@ class _Leaving:
         """Whether an object at that distance may be held as it was."""
         return distance_m - self._held_m <= self._allowed_m
 
-    def add(self, distance_m: float) -> bool:
-        """Take a sample; whether it is sure now."""
+    def add(self, distance_m: float, after_s: float) -> bool:
+        """Take a sample, so long after the last one; whether it is sure now."""
         self.away_m = away_m = distance_m - self._held_m
         most_m = _STEP_SHARE * self._threshold_m
         self._sum_m = max(0.0, self._sum_m + min(away_m - self._allowed_m, most_m))
-        self._held_m += _FOLLOW * min(max(away_m, -self._follow_m), self._follow_m)
+        towards_m = min(max(away_m, -self._follow_m), self._follow_m)
+        self._held_m += towards_m * min(1.0, after_s / _FOLLOW_S)
         return self._sum_m > self._threshold_m or self.slip_m > _SLIP_M
 
 
@@ -505,10 +506,11 @@ class _Grip:
                 self._give_up(self._frozen)
                 return
             self._frozen = ""
-        if now_s > self._seen_s:
-            self._fall_m_s = max(0.0, (self._seen[2] - seen[2]) / (now_s - self._seen_s))
+        after_s = now_s - self._seen_s
+        if after_s > 0.0:
+            self._fall_m_s = max(0.0, (self._seen[2] - seen[2]) / after_s)
         self._seen, self._seen_s, self._seen_step, self._hand = seen, now_s, step, hand
-        is_sure = self._leaving.add(distance_m)
+        is_sure = self._leaving.add(distance_m, after_s)
         if not self._leaving.is_possible:
             self._departed, self._good_hand = None, hand
             self._slip_m = self._leaving.slip_m

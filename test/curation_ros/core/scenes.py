@@ -58,7 +58,7 @@ def scene(
     held = bowl[let_go - 1]
     bowl[let_go:] = held
     bowl[let_go:, 2] = np.maximum(held[2] - 0.5 * G_M_S2 * since_s**2, 1.0 - BELOW_M)
-    bowl[:, 0] += tremor_m * (step % 2)
+    bowl[:, 0] += tremor_m * (step % 3)
 
     is_open = (step < APPROACH) | (step >= opened_at)
     lagged = is_open[np.maximum(step - 2, 0)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from episodes import with_fields
@@ -120,6 +122,37 @@ def test_what_follows_the_release_changes_nothing() -> None:
     for made in ({}, {"dropped_at": LIFT_AT + 30}):
         short, long = scene(**made), scene(**made, hover=250)  # type: ignore[arg-type]
         assert carrying_of(short) == carrying_of(long)
+
+
+@pytest.mark.parametrize("rate_hz", [10, 50, 200])
+def test_other_rates_find_the_same(rate_hz: int) -> None:
+    rng = np.random.default_rng(4)
+    carried = at_rate(scene(tilt_rad=0.5), rate_hz)
+    assert only_hold(carried).state == "carried"
+    assert carrying_of(poor(carried, rng)).state == "carried"
+    left = TRANSPORT_AT + 20
+    stays = scene(dropped_at=left, tremor_m=TREMOR_M)
+    bowl = stays.fields["bowl_position"].copy()
+    bowl[left:, 1:] = bowl[left, 1:]  # it does not even fall: it only stays where it is
+    for made in (scene(dropped_at=left), with_fields(stays, bowl_position=bowl)):
+        made = at_rate(made, rate_hz)
+        hold = only_hold(made)
+        assert hold.state == "broken"
+        assert hold.noticed is not None
+        noticed_s = (made.stamps_ns[hold.noticed] - made.start_ns) / 1e9
+        assert left / 20 <= noticed_s < left / 20 + 1.5
+        assert carrying_of(poor(made, rng)).state == "broken"
+
+
+def at_rate(episode: Episode, rate_hz: int) -> Episode:
+    """The same motion at another rate than 20 Hz; what is not a place is held."""
+    at = np.arange(0.0, len(episode) - 1, 20 / rate_hz)
+    fields = {name: values[at.astype(int)] for name, values in episode.fields.items()}
+    for name in ("eef_position", "bowl_position", "plate_position"):
+        columns = [np.interp(at, range(len(episode)), c) for c in episode.fields[name].T]
+        fields[name] = np.column_stack(columns)
+    stamps_ns = episode.start_ns + np.rint(at * 50e6).astype(np.int64)
+    return replace(episode, stamps_ns=stamps_ns, fields=fields)
 
 
 # --- put down -----------------------------------------------------------------------------------
