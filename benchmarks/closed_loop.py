@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -46,6 +46,7 @@ from sim_node.expert import Controller, Expert
 from sim_node.starts import Start, generated_start, official_start
 
 COMMAND = "python benchmarks/run.py closed_loop"
+PARTS = ("speed", "pairs")
 N_ROUNDS = 9
 N_SUBSTEPS = 25
 N_SCRIPTED = 34
@@ -350,12 +351,19 @@ def paired_rows(
     paths, itself = Comparison(), Comparison()
     counts: dict[str, list[int]] = {}
     for pair in pairs(clean, contaminated):
+        began_s = time.perf_counter()
         run = run_pair(lean, pair)
         paths.add(pair, run, run_pair(stock, pair))
         itself.add(pair, run, run_pair(lean, replace(pair, start=moved(pair.start))))
         count = counts.setdefault(pair.kind, [0, 0])
         count[0] += 1
         count[1] += run.result.is_success
+        print(
+            f"{pair.kind} {pair.start.name}: {time.perf_counter() - began_s:.0f} s; alike so far "
+            f"{paths.n_outcome} in outcome, {paths.n_length} in length",
+            file=sys.stderr,
+            flush=True,
+        )
     kinds = ", ".join(f"{n} {kind} ({k} succeed)" for kind, (n, k) in counts.items())
     total = sum(n for n, _ in counts.values())
 
@@ -369,7 +377,7 @@ def paired_rows(
                 n,
                 "episodes",
                 against=control,
-                ratio=n / n_itself,
+                ratio=n / n_itself if n_itself else None,
                 target=f"{total}",
                 holds=n == total,
                 note=note,
@@ -383,7 +391,7 @@ def paired_rows(
     for (what, when), apart_m in paths.apart_m.items():
         prefix, itself_m = f"paired episodes, {what} apart {when}", itself.apart_m[what, when]
         control = f"{prefix}, lean against itself"
-        ratio = apart_m / itself_m
+        ratio = apart_m / itself_m if itself_m else None  # nothing was touched
         rows.append(
             row(f"{prefix}, lean against stock", apart_m, "m", against=control, ratio=ratio)
         )
@@ -391,14 +399,14 @@ def paired_rows(
     return rows
 
 
-def row(name: str, value: float, unit: str, **extra: float | str | bool) -> dict[str, Any]:
+def row(name: str, value: float, unit: str, **extra: float | str | bool | None) -> dict[str, Any]:
     """A row of results.json."""
     empty = {"against": "", "ratio": None, "target": None, "holds": None}
     return {"name": name, "value": value, "unit": unit, **empty, **extra, "command": COMMAND}
 
 
-def measure(dataset: Path | None) -> list[dict[str, Any]]:
-    """All rows, measured in this process."""
+def measure(dataset: Path | None, parts: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Rows as they are measured, in this process."""
     with tempfile.TemporaryDirectory() as temporary:
         if dataset is None:
             dataset = Path(temporary) / "demonstrations"
@@ -406,11 +414,13 @@ def measure(dataset: Path | None) -> list[dict[str, Any]]:
                 assert not collected.problem, collected
         clean, contaminated = policies(Dataset(dataset))
     with LiberoEnv() as lean, LiberoEnv(lean=False) as stock:
-        rows = speed_rows(lean, stock, clean)
-        compiled = n_compiled()
-        name = "closed loop, functions compiled by a later start without a compiler"
-        rows.append(row(name, compiled, "", target="0", holds=compiled == 0))
-        return rows + paired_rows(lean, stock, clean, contaminated)
+        if "speed" in parts:
+            yield from speed_rows(lean, stock, clean)
+            compiled = n_compiled()
+            name = "closed loop, functions compiled by a later start without a compiler"
+            yield row(name, compiled, "", target="0", holds=compiled == 0)
+        if "pairs" in parts:
+            yield from paired_rows(lean, stock, clean, contaminated)
 
 
 def run() -> list[dict[str, Any]]:
@@ -425,7 +435,9 @@ def run() -> list[dict[str, Any]]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("dataset", type=Path, nargs="?", help="demonstrations with truth")
+    parser.add_argument("--part", choices=PARTS, help="default: all")
     arguments = parser.parse_args()
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    for result in measure(arguments.dataset):
-        print(json.dumps(result))
+    wanted = (arguments.part,) if arguments.part else PARTS
+    for result in measure(arguments.dataset, wanted):
+        print(json.dumps(result), flush=True)
