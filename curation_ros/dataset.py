@@ -11,7 +11,7 @@ import fcntl
 import json
 import os
 import sqlite3
-import tempfile
+import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -31,7 +31,9 @@ from curation_ros.index import TABLES, Index, SpoiltIndexError
 def write_atomically(path: Path, text: str) -> None:
     """Write a whole file or nothing, and have it on disk when this returns."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    # Not tempfile's: its files are for their owner's eyes alone.
+    name = path.parent / f".{path.name}.{uuid.uuid4().hex}"
+    handle = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
         with os.fdopen(handle, "w") as out:
             out.write(text)
