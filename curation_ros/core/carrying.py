@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import dist, hypot, isfinite
+from math import dist, hypot
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -291,16 +291,18 @@ class _Rows:
         self.places: dict[str, list[list[float]]] = {
             k: v.tolist() for k, v in self.objects.items()
         }
-        self._phase = episode.phase if labels else None
-        self._labels = labels
+        self.has_hand = _finite(self.effector).tolist()
+        self.has_place = {k: _finite(v).tolist() for k, v in self.objects.items()}
+        self.seconds: list[float] = self.times_s.tolist()
+        phase = episode.phase if labels else None
+        #: Name of the phase of each step, empty without phases.
+        self.labels = (
+            [""] * len(episode) if phase is None else [labels.get(int(k), "") for k in phase]
+        )
         try:
-            self.is_open = commanded(episode) > 0
+            self.is_open: list[bool] = (commanded(episode) > 0).tolist()
         except EpisodeError:  # no gripper: then nobody says that something was let go
-            self.is_open = np.zeros(len(episode), dtype=bool)
-
-    def label(self, step: int) -> str:
-        """Name of the phase of a step, empty without phases."""
-        return "" if self._phase is None else self._labels.get(int(self._phase[step]), "")
+            self.is_open = [False] * len(episode)
 
 
 @dataclass(frozen=True)
@@ -348,7 +350,7 @@ def _grasp(rows: _Rows, step: int) -> _Grasp:
     if others and others[0][0] - nearest_m < _SAME_DISTANCE_M + 2.0 * noise_m:
         return _Grasp(reason=f"which was grasped cannot be told: {name} or {others[0][2]}")
     at = rows.objects[name][first : step + 1]
-    both = _is_fresh(at) & np.isfinite(at).all(axis=1) & np.isfinite(hand).all(axis=1)
+    both = _is_fresh(at) & _finite(at) & _finite(hand)
     return _Grasp(
         object=name,
         unseen=unseen,
@@ -357,6 +359,11 @@ def _grasp(rows: _Rows, step: int) -> _Grasp:
         hand=np.median(hand[both], axis=0).tolist(),
         at=np.median(at[both], axis=0).tolist(),
     )
+
+
+def _finite(places: Floats) -> Mask:
+    """(n,) whether all of a row is finite."""
+    return np.asarray(np.isfinite(places).all(axis=1))
 
 
 def _is_fresh(places: Floats) -> Mask:
@@ -372,7 +379,7 @@ def _noise_m(places: Floats) -> float:
     Args:
         places: (n, 3) before the grasp.
     """
-    steps = np.diff(places[np.isfinite(places).all(axis=1)], axis=0)
+    steps = np.diff(places[_finite(places)], axis=0)
     changed = steps.any(axis=1)
     if len(steps) >= _MIN_STILL_STEPS and not changed.any():
         return 0.0
@@ -457,19 +464,20 @@ class _Grip:
         """Look at one more step in which the object is to be carried."""
         self._last = step
         if not self._is_over and self._departed is None:
-            self._phase = rows.label(step)
-        if not self._grasp.object:
+            self._phase = rows.labels[step]
+        name = self._grasp.object
+        if not name:
             return
-        now_s = float(rows.times_s[step])
+        now_s = rows.seconds[step]
         if step == self._first:
             self._seen_s = now_s
-        hand, seen = rows.hands[step], rows.places[self._grasp.object][step]
-        if not all(map(isfinite, hand)):
+        if not rows.has_hand[step]:
             return
+        hand, seen = rows.hands[step], rows.places[name][step]
         self._moved_m = max(self._moved_m, dist(hand, self._grasp.hand))
         if self._opened_z is None and rows.is_open[step]:
             self._opened_z = float(np.median([z for _, _, z in self._good]))
-        if not all(map(isfinite, seen)) or (seen == self._seen and not self._may_rest()):
+        if not rows.has_place[name][step] or (seen == self._seen and not self._may_rest()):
             self._wait(now_s, hand)
             return
         if hand[2] >= self._top[0]:
@@ -543,9 +551,12 @@ class _Grip:
         return float(np.dot(went, way)) / length_m if length_m > 0.0 else 0.0
 
     def _has_jumped(self, now_s: float, hand: Point, seen: Point) -> bool:
+        free_m = _JUMP_M + _JUMP_NOISES * self._grasp.noise_m
+        if dist(seen, self._seen) <= free_m:
+            return False
+        free_m += dist(hand, self._hand)
         dx, dy, dz = (a - b for a, b in zip(seen, self._seen, strict=True))
         after_s = now_s - self._seen_s
-        free_m = _JUMP_M + _JUMP_NOISES * self._grasp.noise_m + dist(hand, self._hand)
         # Two steps of a tracker may lie farther apart than their stamps say.
         fall_m = self._fall_m_s * after_s + 0.5 * _GRAVITY_M_S2 * (after_s + 0.05) ** 2
         return hypot(dx, dy, max(dz, 0.0)) > free_m or -dz > free_m + fall_m
