@@ -27,6 +27,8 @@ TASK = "libero_spatial/0"
 
 _REPEAT_S = 0.5
 _CHECK_S = 1.0
+# Two nodes find each other in part of a second; on a machine that is busy, in several.
+_HEARING_S = 10.0
 
 
 class AbortedError(Exception):
@@ -151,6 +153,7 @@ class Driver:
         commands: Commands,
         settings: Mapping[str, Any],
         announced: Callable[[str], Iterator[bool]] = lambda _id: iter(()),
+        deaf: Callable[[str], str] = lambda _id: "",
         stamp_ns: int | None = None,
     ) -> None:
         """Make a driver.
@@ -161,6 +164,7 @@ class Driver:
             commands: filled by the node's subscriptions.
             settings: the node's parameters.
             announced: yields until who is waited for has taken notice of a started episode.
+            deaf: name of who is waited for and has no command of a started episode yet, or empty.
             stamp_ns: before the first stamp; default: the wall's time.
         """
         self._env = env
@@ -168,6 +172,7 @@ class Driver:
         self._commands = commands
         self._p = settings
         self._announced = announced
+        self._deaf = deaf
         self._checked_s = 0.0
         self.reset_wanted = False
         # Stamps begin at the wall's time and never go back, not at a reset either.
@@ -239,12 +244,14 @@ class Driver:
             return [0.0, 0.0, 0.0], 0.0
         timeout_s = self._p["command_timeout_s"]
         asked_s = repeated_s = time.monotonic()
-        while missing := self._commands.missing(self._stamp_ns):
+        while (missing := self._commands.missing(self._stamp_ns)) or self._unheard(run):
             now_s = time.monotonic()
             if self.reset_wanted:
                 raise AbortedError("reset was asked for")
-            if now_s - asked_s > timeout_s:
+            if missing and now_s - asked_s > timeout_s:
                 raise AbortedError(f"no answer on {' and '.join(missing)} within {timeout_s:g} s")
+            if now_s - asked_s > timeout_s + _HEARING_S:
+                raise AbortedError(f"the first command does not reach {self._unheard(run)}")
             if now_s - repeated_s > _REPEAT_S:
                 repeated_s = now_s
                 self._out.observation(self._stamp_ns, observation, tracker, run.id)
@@ -255,6 +262,15 @@ class Driver:
             if strangers := self._out.several_commanders():
                 raise AbortedError(f"commands come from {strangers}: stop all but one")
         return self._commands.newest
+
+    def _unheard(self, run: Run) -> str:
+        """Who has not got the first command yet.
+
+        That we hear the commander and are heard by the recorder says nothing of those two. What
+        follows the first command follows it everywhere, for the transport is reliable; until
+        then the observation is repeated, and so is its answer.
+        """
+        return "" if run.executed else self._deaf(run.id)
 
     def _paced(self, run: Run) -> Iterator[bool]:
         """Wait, when free, until the wall has come as far as the episode."""

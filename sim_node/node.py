@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 from curation_ros.core.status import ERROR, OK, Status
 from curation_ros.dataset import Dataset
 from curation_ros.nodes.health import Health
-from curation_ros.nodes.messages import time_from_ros
+from curation_ros.nodes.messages import status_from_ros, time_from_ros
 from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import LATCHED, MAPPED
 from curation_ros.nodes.spinning import Finished, run
@@ -78,8 +78,9 @@ class SimNode(Node):
         self.get_logger().info(f"LIBERO and {len(starts)} starts ready in {ready_s:.1f} s")
         self._out = SimPublishers(self, self._env, owner=p["episodes"] > 0, expert=self._expert)
         self._commands = Commands()
-        self._driver = Driver(self._env, self._out, self._commands, p, self._announced)
-        self._recorder: dict[str, str] = {}
+        self._driver = Driver(self._env, self._out, self._commands, p, self._announced, self._deaf)
+        self._is_recorded = p["episodes"] > 0 and "recorder" in p["wait_for"]
+        self._recorder: dict[str, Status] = {}
         if not self._expert:
             for topic, kind in zip(COMMAND_TOPICS, (TwistStamped, JointState), strict=True):
                 self.create_subscription(kind, topic, self._taker(topic), MAPPED)
@@ -96,8 +97,8 @@ class SimNode(Node):
         )
 
     def _on_recorder(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            self._recorder[status.hardware_id] = status.message.partition(" ")[0]
+        for status in map(status_from_ros, message.status):
+            self._recorder[status.hardware_id] = status
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._driver.reset_wanted = True
@@ -143,12 +144,23 @@ class SimNode(Node):
     def _announced(self, episode_id: str) -> Iterator[bool]:
         return self._until_recorder(episode_id, "recording", "closed", "failed")
 
+    def _deaf(self, episode_id: str) -> str:
+        """The recorder, until it says with its counts that the commands of an episode arrive."""
+        said = self._recorder.get(episode_id)
+        if not self._is_recorded or said is None or not said.message.startswith("recording"):
+            return ""
+        return "" if any(key.startswith("count/") for key in said.values) else "recorder"
+
     def _until_recorder(self, episode_id: str, *states: str) -> Iterator[bool]:
         """Wait for the recorder to say that of an episode, if it is in the game."""
-        if self._p["episodes"] and "recorder" in self._p["wait_for"]:
-            yield from self._until_none(
-                lambda: [] if self._recorder.get(episode_id) in states else ["recorder"]
-            )
+
+        def missing() -> list[str]:
+            said = self._recorder.get(episode_id)
+            state = said.message.partition(" ")[0] if said is not None else ""
+            return [] if state in states else ["recorder"]
+
+        if self._is_recorded:
+            yield from self._until_none(missing)
 
     def _until_none(self, missing: Callable[[], list[str]]) -> Iterator[bool]:
         """Wait until nobody is missing, with a line in the log every few seconds."""

@@ -74,6 +74,7 @@ class Recorder(Node):
         self.create_service(SetBool, "~/finalize", self._finalize)
         self._health = Health(self)
         self._last_id = ""
+        self._begun: dict[str, str] = {}  # id -> name, until its commands arrive
         self._tell(recover_partials(self._dataset))
         self._by_hand: ByHand | None = None
         if not p["auto"]:
@@ -98,6 +99,8 @@ class Recorder(Node):
         if self._by_hand is not None and sample.topic == self._map.clock_topic:
             self._by_hand.clock_ns = sample.stamp_ns
         self._tell(self._recording.sample(sample, time.monotonic()))
+        if self._begun:
+            self._tell_commands_arrive()
 
     # --- services ---------------------------------------------------------------------------
 
@@ -156,9 +159,21 @@ class Recorder(Node):
         if was_open:  # the curator must hear of it: it judges the bag, not what went on
             deliver([self._status])
 
+    def _tell_commands_arrive(self) -> None:
+        """Say once of an episode that its commands come here, too, so that its owner may go on."""
+        for episode_id, name in list(self._begun.items()):
+            counts = self._recording.counts(episode_id)
+            if all(counts.get(topic) for topic in self._map.command_topics):
+                del self._begun[episode_id]
+                values = {"reason": "its commands arrive", **counts_to_values(counts)}
+                self._publish(Status(OK, name, f"recording {episode_id}", episode_id, values))
+
     def _tell(self, notices: Sequence[Notice]) -> None:
         for n in notices:
             self._last_id = n.id if n.state == "closed" else self._last_id
+            self._begun.pop(n.id, None)
+            if n.state == "recording":
+                self._begun[n.id] = n.name
             level = ERROR if n.state == "failed" else OK
             values = {"reason": n.reason or self._free()}
             values |= counts_to_values(n.counts)

@@ -1,10 +1,7 @@
-"""The policy node: how it answers, and that the graph goes the same way as one process."""
+"""The policy node: how it answers, and what it refuses."""
 
 from __future__ import annotations
 
-import json
-
-import numpy as np
 import pytest
 import yaml
 from episodes import topic_map
@@ -12,15 +9,9 @@ from graph import MAPPED, JointState, TwistStamped
 from robot import Robot, libero_take, plain, stamp_ns
 from test_policy import policy
 
-from curation_ros.bags.reader import read_episode
-from curation_ros.cli.main import main as curation
-
 pytestmark = [pytest.mark.ros, pytest.mark.policy]
-sim = pytest.mark.sim
 
 COMMANDS = ("command/twist", "command/gripper")
-MAX_STEPS = 30
-START = "generated:5:1"
 
 
 @pytest.fixture(scope="module")
@@ -110,78 +101,6 @@ def test_episode_joined_in_its_middle_is_not_driven(answers):
     answers.robot.send(steps[3])
     answers.graph.problem("policy_node", "its first observation was not seen: not driving it")
     assert not answers.heard[COMMANDS[0]]
-
-
-# --- driving --------------------------------------------------------------------------------
-
-
-@sim
-def test_graph_and_one_process_go_the_same_way(graph, answers, folder, request):
-    """The same policy from the same start: equal observations and commands, to the last bit."""
-    pytest.importorskip("libero", reason="LIBERO is not installed")
-    from policy_node.policy import Policy
-    from policy_node.rollouts import field_values
-    from sim_node.env import LiberoEnv
-    from sim_node.starts import parse_starts
-
-    dataset = graph.folder / "driven"
-    answers.robot.node.destroy_node()
-    graph.events.clear()
-    graph.start("recorder", dataset=dataset)
-    # Recorder and policy discover each other while the simulator starts, not after: the sim waits
-    # for both, but cannot see whether each of them sees the other.
-    graph.ready("recorder")
-    for topic in COMMANDS:
-        graph.until(lambda t=topic: graph.node.count_subscribers(t), f"the recorder hears {topic}")
-    graph.start(
-        "sim_node",
-        mode="command",
-        starts=START,
-        max_steps=MAX_STEPS,
-        wait_for=["policy_node", "recorder"],
-    )
-    code, log = graph.expect_exit("sim_node")
-    assert code == 0, log
-    episode_id = next(e.id for e in graph.events if e.event == "ended")
-    driven = read_episode(dataset / "episodes" / episode_id)
-
-    from policy_node.rollouts import SimController
-    from sim_node.episodes import run_episode
-
-    steps = []
-    with LiberoEnv() as env:
-        run_episode(
-            env,
-            parse_starts(START)[0],
-            SimController(Policy.load(folder)),
-            max_steps=MAX_STEPS,
-            on_step=steps.append,
-        )
-    assert len(driven) == len(steps) == MAX_STEPS
-    np.testing.assert_array_equal(driven.field("twist"), [s.action_xyz for s in steps])
-    np.testing.assert_array_equal(driven.field("gripper")[:, 0], [s.gripper for s in steps])
-    np.testing.assert_array_equal(driven.field("phase")[:, 0], [s.phase_index for s in steps])
-    for name in field_values(steps[0].observation):
-        expected = [field_values(s.observation)[name] for s in steps]
-        np.testing.assert_array_equal(driven.field(name), expected)
-
-
-@sim
-def test_evaluate_on_the_graph_prints_rows_as_in_one_process(folder, capsys):
-    pytest.importorskip("libero", reason="LIBERO is not installed")
-    words = ["evaluate", "--policy", str(folder), "--starts", "generated:5:2", "--json"]
-    words += ["--max-steps", str(MAX_STEPS)]
-    assert curation([*words, "--graph"]) == 0
-    on_graph = capsys.readouterr().out
-    assert curation(words) == 0
-    assert on_graph == capsys.readouterr().out
-    *rows, summary = (json.loads(line) for line in on_graph.splitlines())
-    assert [row["start"] for row in rows] == ["generated-5-000", "generated-5-001"]
-    for row in rows:
-        assert set(row) == {"policy", "start", "success", "steps", "stage"}
-        assert (row["success"], row["steps"]) == (False, MAX_STEPS)
-    assert (summary["successes"], summary["rollouts"], summary["interval"]) == (0, 2, "wilson")
-    assert summary["ci95"][0] == 0.0
 
 
 # --- errors ---------------------------------------------------------------------------------
