@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import tempfile
 import threading
 import time
@@ -41,7 +42,8 @@ def evaluate_on_graph(
         A row a rollout as it ends: policy, start, success, steps, stage.
 
     Raises:
-        CurationError: if a node fails or falls silent; the message has its last words.
+        CurationError: if a node ends or falls silent, or a rollout was not driven to its end: that
+            is no failure of the policy.
     """
     n = count_starts(starts)
     domain = Domain()
@@ -66,8 +68,8 @@ def evaluate_on_graph(
             )
             seen, heard_s = 0, time.monotonic()
             while seen < n and not (stop is not None and stop.is_set()):
-                nodes.check()
                 ended = nodes.ended("sim_node") is not None
+                _check_nodes(nodes, log_folder)
                 lines = _whole_lines(Path(folder) / "truth.jsonl")
                 for line in lines[seen:]:
                     yield _row(policy_id, json.loads(line))
@@ -83,6 +85,19 @@ def evaluate_on_graph(
                     time.sleep(0.1)
         finally:
             domain.close()
+
+
+def _check_nodes(nodes: Nodes, log_folder: Path) -> None:
+    """Complain of a node that has ended too early; of one that refused to run, with its words."""
+    for node in ("policy_node", "sim_node"):
+        code = nodes.ended(node)
+        log = log_folder / f"{node}.log"
+        if code is not None and code < 0:
+            name = signal.Signals(-code).name
+            raise CurationError(f"{node} was ended by signal {name}: its log is {log}")
+        if code == 0 and node == "policy_node":
+            raise CurationError(f"{node} was stopped by somebody else: its log is {log}")
+    nodes.check()
 
 
 def count_starts(spec: str) -> int:
@@ -119,11 +134,12 @@ def _whole_lines(path: Path) -> list[str]:
 
 
 def _row(policy_id: str, truth: dict[str, Any]) -> dict[str, Any]:
+    if truth["aborted"]:
+        raise CurationError(f"rollout from {truth['start']} was aborted: {truth['aborted']}")
     return {
         "policy": policy_id,
         "start": truth["start"],
         "success": truth["outcome"] == "succeeded",
         "steps": truth["steps"],
         "stage": truth["stage"],
-        **({"aborted": truth["aborted"]} if truth.get("aborted") else {}),
     }

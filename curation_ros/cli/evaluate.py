@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 from curation_ros.cli.arguments import add_workers
 from curation_ros.cli.output import percent, print_json, say
+from curation_ros.configuration import topic_map_or_default
 from curation_ros.evaluating import evaluate_on_graph, summary
 from curation_ros.workers import spread
 
@@ -33,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from policy_node.policy import Policy
 
     policy = Policy.load(args.policy)
+    policy.check(topic_map_or_default(""))
     rows = []
     for row in _rollouts(args, policy):
         rows.append(row)
@@ -56,6 +59,8 @@ def _rollouts(args: argparse.Namespace, policy: Any) -> Iterator[dict[str, Any]]
         yield from evaluate_on_graph(
             args.policy, policy.id, args.starts, max_steps=args.max_steps, log_folder=logs
         )
+        if args.logs is None:  # after an error they stay: the message names them
+            shutil.rmtree(logs, ignore_errors=True)
         return
     from curation_ros.judging import roll_policy
     from sim_node.starts import start_names
