@@ -37,7 +37,11 @@ _GREY, _DARK = "#767676", "#333333"
 _SUCCEEDED, _FAILED = "#0072B2", "#D55E00"
 #: Baselines that are drawn as lines across: row -> dashes.
 _LINES: dict[str, Any] = {"oracle": "--", "reference": "-.", "everything": ":"}
+#: Least distance of two points in AUROC, so that equal ones can be told apart.
+_BESIDE = 0.02
 _TWIN = "_label_free"
+#: Where an SVG names an id.
+_USES = re.compile(r'(url\(#|href="#)([^)"]+)')
 _RC: Any = {  # typed by matplotlib as one of its 400 keys
     "svg.fonttype": "none",
     "svg.hashsalt": "curation",
@@ -100,19 +104,31 @@ def _svg(draw: Callable[[FigureBase], None], size_in: tuple[float, float]) -> st
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
         canvas.savefig(out, format="svg", metadata=nothing)
     # A hundredth of a point is finer than any screen, and a third of the bytes.
-    return re.sub(r' d="[^"]*"', lambda d: re.sub(r"(\.\d\d)\d+", r"\1", d[0]), out.getvalue())
+    svg = re.sub(r' d="[^"]*"', lambda d: re.sub(r"(\.\d\d)\d+", r"\1", d[0]), out.getvalue())
+    return _numbered(svg)
+
+
+def _numbered(svg: str) -> str:
+    """An SVG with the ids that it uses, numbered.
+
+    Those of matplotlib are hashes of places whose last bits the layout's solver may give otherwise
+    the next time.
+    """
+    used = {
+        i: f"i{k}" for k, i in enumerate(dict.fromkeys(name for _, name in re.findall(_USES, svg)))
+    }
+
+    def own(found: re.Match[str]) -> str:
+        return f' id="{used[found[1]]}"' if found[1] in used else ""
+
+    svg = re.sub(r' id="([^"]+)"', own, svg)
+    return re.sub(_USES, lambda found: f"{found[1]}{used[found[2]]}", svg)
 
 
 def _inline(svg: str, prefix: str, alt: str) -> str:
-    """An SVG that can stand in a page beside others: no prolog, and ids of its own."""
+    """A numbered SVG that can stand in a page beside others: no prolog, and ids of its own."""
     svg = svg[svg.index("<svg") :].strip()
-    used = set(re.findall(r'(?:url\(#|href="#)([^)"]+)', svg))
-
-    def own(found: re.Match[str]) -> str:
-        return f' id="{prefix}-{found[1]}"' if found[1] in used else ""
-
-    svg = re.sub(r' id="([^"]+)"', own, svg)
-    svg = re.sub(r'(url\(#|href="#)', rf"\g<1>{prefix}-", svg)
+    svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", svg)
     quoted = alt.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     return svg.replace("<svg ", f'<svg role="img" aria-label="{quoted}" ', 1)
 
@@ -145,8 +161,9 @@ def detection_panel(
     def draw(canvas: FigureBase) -> None:
         axes = canvas.subplots()
         _lines(axes, rows)
-        for row in points:
-            x, y = row["auroc"], row["rate"]
+        places = _apart([r["auroc"] for r in points], _BESIDE, floor=-1.0)
+        for x, row in zip(places, points, strict=True):
+            y = row["rate"]
             look = style(row["scorer"])
             axes.errorbar(
                 x,
@@ -433,13 +450,13 @@ def _labelled(axes: Axes, rates: Mapping[str, float]) -> None:
         )
 
 
-def _apart(heights: Sequence[float], gap: float) -> list[float]:
-    """Heights of labels, moved apart where they would lie upon each other."""
+def _apart(heights: Sequence[float], gap: float, floor: float = 0.0) -> list[float]:
+    """Places of what would lie upon each other: moved down from the highest, not below a floor."""
     placed: dict[int, float] = {}
     above = math.inf
     for k in sorted(range(len(heights)), key=lambda k: -heights[k]):
         above = placed[k] = min(heights[k], above - gap)
-    too_low = max(0.0, -min(placed.values(), default=0.0))
+    too_low = max(0.0, floor - min(placed.values(), default=floor))
     return [placed[k] + too_low for k in range(len(heights))]
 
 

@@ -75,10 +75,10 @@ def _detection(found: Row) -> Iterator[Block]:
     yield figures.figure(
         "figure-main",
         "AUROC against success. The AUROC is of the score that ranks: with length controlled, but "
-        "for length itself. Bars: 95 % intervals, of success over "
-        "training seeds and starts; dots: the policy of each training seed. The paper's points "
-        "with its standard deviations stand last. A scorer that needs no fit on the reference has "
-        "an open marker.",
+        "for length itself. Bars: 95 % intervals, of success over training seeds and starts; "
+        "dots: the policy of each training seed. Points of nearly equal AUROC are drawn beside "
+        "each other. The paper's points with its standard deviations stand last. A scorer that "
+        "needs no fit on the reference has an open marker.",
         [*drawings, figures.published_panel()],
     )
     for stage in found["stages"]:

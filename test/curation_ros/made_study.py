@@ -30,7 +30,7 @@ def small_plan(**changes: Any) -> StudyPlan:
     """A stage of each kind, few of everything."""
     collected = {"episodes": 20, "contamination": 0.6, "defect": "early_release", "seed": 1}
     stage = {"pools": ["paired"], "variants": ["relative", "fingers"], "seeds": [1, 2, 3]}
-    ranked = [f"{name}@{{4,8,12}}" for name in SKILL]
+    ranked = [f"{name}@{{4,8,12}}" for name in ("knn", "gripper_timing", "entropy")]
     stages = [
         {
             **stage, "name": "paper", "kind": "protocol", "starts": "generated:21:4",
