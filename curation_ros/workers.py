@@ -84,6 +84,9 @@ def spread(
 
     # Who interrupts us does not ask what became of the tasks ahead.
     warnings.filterwarnings("ignore", "[0-9]+ tasks ", UserWarning)
+    # loky starts a worker anew that has grown by 100 MB, as simulators and torch do; one that
+    # died is an error of ours.
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs ", UserWarning)
     with workers(backend, jobs), _deaths():
         if backend == "ray":
             parallel = Parallel(n_jobs=jobs)
