@@ -1,0 +1,102 @@
+"""The sim node with a recorder that does not hear the commander: no step goes unrecorded."""
+
+from __future__ import annotations
+
+import pytest
+from commander import Commander
+from graph import LATCHED, MAPPED, DiagnosticArray, JointState, PoseStamped
+from robot import stamp_ns
+
+from curation_ros.bags.reader import read_episode
+
+pytestmark = [pytest.mark.ros, pytest.mark.sim]
+pytest.importorskip("libero", reason="LIBERO is not installed")
+
+PERIOD_NS = 50_000_000
+MAX_STEPS = 3
+
+
+@pytest.fixture(scope="module")
+def hearing(graph):
+    """The recorder gets gripper commands only where a test passes them on."""
+    graph.start("recorder", dataset=graph.folder / "data", remaps={"command/gripper": "passed_on"})
+    graph.start(
+        "sim_node",
+        mode="command",
+        episodes=2,
+        starts="generated:0:1",
+        max_steps=MAX_STEPS,
+        wait_for=["recorder", "commander"],
+    )
+    commander = Commander(graph)
+    seen = []
+    commander.node.create_subscription(PoseStamped, "eef_pose", seen.append, MAPPED)
+    commander.node.create_subscription(DiagnosticArray, "episode", lambda _: None, LATCHED)
+    passed_on = commander.node.create_publisher(JointState, "passed_on", MAPPED)
+    graph._executor.add_node(commander.node)
+    yield Hearing(graph, commander, seen, passed_on)
+    graph._executor.remove_node(commander.node)
+    commander.close()
+    graph.stop("recorder")
+
+
+class Hearing:
+    def __init__(self, graph, commander, seen, passed_on):
+        self.graph = graph
+        self.commander = commander
+        self.seen = seen
+        self.passed_on = passed_on
+
+    def observation(self, after_ns=0):
+        """The next observation that is later than a stamp."""
+        while True:
+            self.graph.until(lambda: self.seen, "an observation")
+            found = self.seen.pop(0)
+            if stamp_ns(found) > after_ns:
+                return found
+
+    def pass_on(self, observation):
+        joints = JointState(header=observation.header, name=["gripper"], position=[-1.0])
+        joints.velocity, joints.effort = [0.0], [0.0]
+        self.passed_on.publish(joints)
+
+    def end(self, n):
+        return self.graph.until(
+            lambda: [e for e in self.graph.events if e.event != "started"][n:], f"end {n}"
+        )[0]
+
+
+def test_first_observation_is_repeated_until_the_recorder_has_its_answer(graph, hearing):
+    first = hearing.observation()
+    for _ in range(3):
+        hearing.commander.say(first)
+        again = hearing.observation()
+        assert again == first
+    hearing.pass_on(first)
+    last_ns = stamp_ns(first)
+    for _ in range(MAX_STEPS - 1):
+        observation = hearing.observation(last_ns)
+        assert stamp_ns(observation) == last_ns + PERIOD_NS
+        last_ns = stamp_ns(observation)
+        hearing.commander.say(observation)
+        hearing.pass_on(observation)
+    event = hearing.end(0)
+    assert event.event == "ended"
+    assert graph.recorded(event.id).message == f"closed {event.id}"
+    episode = read_episode(graph.folder / "data" / "episodes" / event.id)
+    assert episode.findings == ()
+    assert len(episode) == MAX_STEPS
+    said = [s for s in graph.recorders if s.hardware_id == event.id]
+    assert [s.message.partition(" ")[0] for s in said] == ["recording", "recording", "closed"]
+    assert not any(key.startswith("count/") for key in said[0].values)
+    assert said[1].values["count/command/gripper"] == "1"
+
+
+def test_recorder_that_never_has_it_aborts_the_episode(graph, hearing):
+    observation = hearing.observation(hearing.end(0).end_ns)
+    hearing.commander.say(observation)
+    event = hearing.end(1)
+    assert event.reason == "aborted: the first command does not reach recorder"
+    assert event.end_ns == event.start_ns
+    code, log = graph.expect_exit("sim_node")
+    assert code == 0, log
