@@ -13,7 +13,6 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
-from matplotlib.figure import FigureBase
 from matplotlib.ticker import MultipleLocator, PercentFormatter
 
 from curation_ros.core.phases import PHASES
@@ -68,37 +67,43 @@ class Drawing:
         size_in: width and height, inches.
     """
 
-    draw: Callable[[FigureBase], None]
+    draw: Callable[[Canvas], None]
     alt: str
     size_in: tuple[float, float] = (4.6, 4.2)
 
 
 def figure(name: str, caption: str, drawings: Sequence[Drawing], columns: int = 2) -> Figure:
-    """Draw each panel alone and all of them together."""
-    columns = min(columns, len(drawings))
-    width, height = drawings[0].size_in
-    n_rows = math.ceil(len(drawings) / columns)
+    """Draw all panels; in the file of the figure they stand side by side."""
+    panels = tuple(
+        Panel(_inline(_svg(d.draw, d.size_in), f"{name}-{k}", d.alt), d.alt)
+        for k, d in enumerate(drawings)
+    )
+    return Figure(name, caption, panels, _together(panels, drawings[0].size_in, columns))
 
-    def together(canvas: FigureBase) -> None:
-        parts = canvas.subfigures(n_rows, columns, squeeze=False).ravel()
-        for part, drawing in zip(parts, drawings, strict=False):
-            drawing.draw(part)
 
-    return Figure(
-        name,
-        caption,
-        tuple(
-            Panel(_inline(_svg(d.draw, d.size_in), f"{name}-{k}", d.alt), d.alt)
-            for k, d in enumerate(drawings)
-        ),
-        _svg(together, (width * columns, height * n_rows)),
+def _together(panels: Sequence[Panel], size_in: tuple[float, float], columns: int) -> str:
+    """One SVG of panels of equal size."""
+    columns = min(columns, len(panels))
+    width, height = (72 * inches for inches in size_in)  # an SVG of matplotlib counts in points
+    whole = f"{columns * width:g}", f"{math.ceil(len(panels) / columns) * height:g}"
+    parts = []
+    for k, panel in enumerate(panels):
+        place = f'<svg x="{k % columns * width:g}" y="{k // columns * height:g}" '
+        part = panel.svg.replace("<svg ", place, 1)
+        parts.append(re.sub(r' (width|height)="([\d.]+)pt"', r' \1="\2"', part, count=2))
+    return (
+        '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" '
+        f'width="{whole[0]}pt" height="{whole[1]}pt" viewBox="0 0 {whole[0]} {whole[1]}">\n'
+        + "\n".join(parts)
+        + "\n</svg>\n"
     )
 
 
-def _svg(draw: Callable[[FigureBase], None], size_in: tuple[float, float]) -> str:
+def _svg(draw: Callable[[Canvas], None], size_in: tuple[float, float]) -> str:
     with mpl.rc_context(_RC):
         canvas = Canvas(figsize=size_in, layout="constrained")
         draw(canvas)
+        _settle(canvas)
         out = io.StringIO()
         # Without date and version the same figures give the same bytes.
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
@@ -108,12 +113,17 @@ def _svg(draw: Callable[[FigureBase], None], size_in: tuple[float, float]) -> st
     return _numbered(svg)
 
 
-def _numbered(svg: str) -> str:
-    """An SVG with the ids that it uses, numbered.
+def _settle(canvas: Canvas) -> None:
+    """Lay out, and round: the solver of the layout gives other last bits each time."""
+    canvas.draw_without_rendering()
+    canvas.set_layout_engine("none")
+    for axes in canvas.axes:
+        left, bottom, width, height = (round(x, 4) for x in axes.get_position().bounds)
+        axes.set_position((left, bottom, width, height))
 
-    Those of matplotlib are hashes of places whose last bits the layout's solver may give otherwise
-    the next time.
-    """
+
+def _numbered(svg: str) -> str:
+    """An SVG with the ids that it uses, numbered: shorter than matplotlib's hashes."""
     used = {
         i: f"i{k}" for k, i in enumerate(dict.fromkeys(name for _, name in re.findall(_USES, svg)))
     }
@@ -158,7 +168,7 @@ def detection_panel(
     """AUROC against success, a point a scorer at one number kept."""
     points = [r for r in at_keep(rows, keep) if r["rate"] is not None and r["auroc"] is not None]
 
-    def draw(canvas: FigureBase) -> None:
+    def draw(canvas: Canvas) -> None:
         axes = canvas.subplots()
         _lines(axes, rows)
         places = _apart([r["auroc"] for r in points], _BESIDE, floor=-1.0)
@@ -193,7 +203,7 @@ def published_panel() -> Drawing:
     """The paper's own figure, and where its points are with the rows joined by name."""
     scored = [(k, p, p.auroc) for k, p in published.TABLE_2.items() if p.auroc is not None]
 
-    def draw(canvas: FigureBase) -> None:
+    def draw(canvas: Canvas) -> None:
         axes = canvas.subplots()
         _labelled(axes, {k: published.TABLE_2[k].success for k in ("oracle", "everything")})
         for name, one, auroc in scored:
@@ -246,7 +256,7 @@ def keep_panel(
     )
     done = [r for r in curve if r["rate"] is not None]
 
-    def draw(canvas: FigureBase) -> None:
+    def draw(canvas: Canvas) -> None:
         upper, lower = canvas.subplots(2, 1, sharex=True, height_ratios=(3, 1.2))
         look = style(scorer)
         _lines(upper, rows)
@@ -275,7 +285,7 @@ def keep_panel(
 def control_panel(stage: Row, pool: str, variant: str, rows: Sequence[Row]) -> Drawing:
     """Success of the sets that no scorer makes, against how many are kept."""
 
-    def draw(canvas: FigureBase) -> None:
+    def draw(canvas: Canvas) -> None:
         axes = canvas.subplots()
         _lines(axes, rows)
         looks = {"oracle": ("--", "o"), "shuffled": ("-", "s"), "worst": ("-", "v")}
@@ -342,7 +352,7 @@ def contrast_panel(stage: Row) -> Drawing:
     planned = list(stage["contrasts"])
     height = 0.9 + 0.46 * len(planned)
 
-    def draw(canvas: FigureBase) -> None:
+    def draw(canvas: Canvas) -> None:
         axes = canvas.subplots()
         for k, one in enumerate(planned):
             name = f"{one['a']} minus {one['b']} ({one['pool']}, {one['variant']})"
@@ -383,7 +393,7 @@ def contrast_panel(stage: Row) -> Drawing:
 def traces_panel(traces: Sequence[Row], kept: set[str], title: str) -> Drawing:
     """Object height and gripper of kept and discarded demonstrations, phase by phase."""
 
-    def draw(canvas: FigureBase) -> None:
+    def draw(canvas: Canvas) -> None:
         grid = canvas.subplots(2, 2, sharex=True, sharey="row", height_ratios=(2, 1))
         for column, is_kept in enumerate((True, False)):
             some = [t for t in traces if (t["episode"] in kept) == is_kept]
@@ -395,14 +405,13 @@ def traces_panel(traces: Sequence[Row], kept: set[str], title: str) -> Drawing:
                         values = [math.nan if v is None else v for v in one[key]]
                         axes.plot(values, color=color, linewidth=0.8, alpha=0.45)
             n_good = sum(bool(t["good"]) for t in some)
-            what = "kept" if is_kept else "discarded"
+            what = f"{title}\nkept" if is_kept else "discarded"
             grid[0, column].set_title(f"{what}: {len(some)}, {n_good} good", loc="left")
             _phase_axis(grid[1, column], some)
         grid[0, 0].set_ylabel("object height, m")
         grid[1, 0].set_ylabel("gripper")
         grid[1, 0].set_yticks([-1, 1], ["open", "close"])
         grid[1, 0].set_ylim(-1.3, 1.3)
-        canvas.suptitle(title, fontsize=9.5, x=0.01, ha="left")
 
     return Drawing(draw, f"object height and gripper over the phases, {title}", (4.8, 4.0))
 
@@ -460,7 +469,7 @@ def _apart(heights: Sequence[float], gap: float, floor: float = 0.0) -> list[flo
     return [placed[k] + too_low for k in range(len(heights))]
 
 
-def _legend(canvas: FigureBase, axes: Axes, columns: int) -> None:
+def _legend(canvas: Canvas, axes: Axes, columns: int) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         canvas.legend(
