@@ -61,7 +61,7 @@ def grip_of(episode: Episode, *, effort: str = "") -> Carrying:
         judge = _by_effort if effort else _by_gap
         hold = judge(values, Hold(name, first, last, "carried"), before)
         at = last if hold.departed is None else hold.departed
-        where = labels.get(int(phase[at]), "") if phase is not None else ""
+        where = "" if phase is None else labels.get(int(np.nan_to_num(phase[at], nan=-1.0)), "")
         opened = hold.departed is not None and bool(is_open[first : hold.departed + 1].any())
         hold = replace(hold, phase=where, opened=opened)
         if hold.state == "carried" and last == len(held) - 1:

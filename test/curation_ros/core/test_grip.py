@@ -130,6 +130,15 @@ def test_what_cannot_be_known() -> None:
     assert grip_of(without(made, "gripper", "phase")).state == "unknown"
 
 
+def test_steps_of_unknown_phase_end_no_grip() -> None:
+    made = scene(opened_at=LIFT_AT + 30)
+    for unknown in (-1.0, np.nan):
+        phase = made.fields["phase"].copy()
+        phase[LIFT_AT + 25 : LIFT_AT + 40] = unknown
+        hold = only_hold(with_fields(made, phase=phase))
+        assert (hold.state, hold.departed, hold.phase) == ("broken", LIFT_AT + 32, "")
+
+
 def test_without_phases_only_an_empty_grip_shows() -> None:
     early = without(scene(opened_at=LIFT_AT + 30), "phase")
     assert only_hold(early).state == "carried"
