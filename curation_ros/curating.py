@@ -10,19 +10,23 @@ from typing import Any
 
 from curation_ros.bags.reader import read_episode
 from curation_ros.core import decisions
+from curation_ros.core.alerts import AlertWatch
 from curation_ros.core.builder import EpisodeBuilder
 from curation_ros.core.decisions import CURATOR, Decision, in_force
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import CurationError, EpisodeError
+from curation_ros.core.findings import Finding
 from curation_ros.core.gate import Closed, EpisodeGate
 from curation_ros.core.judgement import Ruling
 from curation_ros.core.scoring import Curation
 from curation_ros.core.status import EpisodeEvent, owner_findings
-from curation_ros.core.stream import Decoder, Sample
+from curation_ros.core.stream import NS_PER_S, Decoder, Sample
 from curation_ros.core.topic_map import TopicMap
 from curation_ros.dataset import Dataset
 from curation_ros.examining import EpisodesOf, Examiner, judge_bags, with_copy
 
+#: An episode that runs is looked at for alerts this often, by its own clock.
+ALERT_PERIOD_S = 0.1
 #: Verdicts that a person may give; to salvage needs a span, which only a scorer knows.
 OVERRIDES = ("keep", "discard", "review")
 #: Episodes whose live form is kept until their bags close.
@@ -33,6 +37,8 @@ _REMEMBERED = 8
 class _Live:
     builder: EpisodeBuilder
     event: EpisodeEvent
+    watch: AlertWatch
+    looked_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,22 @@ class Decided:
 
     decision: Decision
     latency_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Alert:
+    """What has gone wrong with an episode that still runs.
+
+    Attributes:
+        episode, name: identity of the episode.
+        finding: what, where and when; its span from the episode's start.
+        seen_ns: stamp of the newest sample by which it was seen.
+    """
+
+    episode: str
+    name: str
+    finding: Finding
+    seen_ns: int
 
 
 class LiveCuration:
@@ -85,6 +107,7 @@ class LiveCuration:
         self._seen: dict[str, Episode] = {}
         self._read: deque[str] = deque(maxlen=_REMEMBERED)
         self._unread: set[str] = set()
+        self._alerts: list[Alert] = []
 
     def event(self, event: EpisodeEvent, now_s: float) -> list[Decided]:
         """Take an event of the episode's owner."""
@@ -98,7 +121,7 @@ class LiveCuration:
                 name=event.name,
                 start_ns=event.start_ns,
             )
-            self._live[event.id] = _Live(builder, event)
+            self._live[event.id] = _Live(builder, event, AlertWatch(self.topic_map))
             for sample in early:
                 builder.push(sample)
         return self.tick(now_s)
@@ -109,6 +132,7 @@ class LiveCuration:
         if episode_id is None:
             return self.tick(now_s)
         self._live[episode_id].builder.push(sample)
+        self._look(episode_id)
         window = self.gate.window(episode_id)
         return self.tick(now_s) if window is not None and window.ended is not None else []
 
@@ -121,6 +145,22 @@ class LiveCuration:
                 self._unread.remove(closed.event.id)
                 decided.append(self._decide_bag(closed.event.id))
         return [d for d in decided if d is not None]
+
+    def take_alerts(self) -> list[Alert]:
+        """Alerts since the last call, oldest first."""
+        alerts, self._alerts = self._alerts, []
+        return alerts
+
+    def _look(self, episode_id: str) -> None:
+        """Look for an alert, where all topics have moved on for long enough."""
+        live = self._live[episode_id]
+        now_ns = live.builder.settled_ns
+        if live.watch.has_spoken or now_ns < live.looked_ns + int(ALERT_PERIOD_S * NS_PER_S):
+            return
+        live.looked_ns = now_ns
+        finding = live.watch.take(live.builder.settled())
+        if finding is not None:
+            self._alerts.append(Alert(episode_id, live.event.name, finding, now_ns))
 
     @property
     def running(self) -> str:

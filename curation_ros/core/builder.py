@@ -41,15 +41,18 @@ class _Track:
         self._stamps: list[Stamps] = []
         self._seqs: list[Stamps] = []
         self._columns: list[Floats] = []
+        self.newest_ns = 0
         self.bad: list[tuple[int, str]] = []
         self.unknown: dict[str, int] = {}
 
     def push(self, sample: Sample) -> None:
+        self.newest_ns = max(self.newest_ns, sample.stamp_ns)
         self._pending.append(sample)
         if len(self._pending) >= _BATCH:
             self._decode_pending()
 
     def push_block(self, block: SampleBlock) -> None:
+        self.newest_ns = max(self.newest_ns, int(block.stamps_ns.max(initial=0)))
         self._decode_pending()
         self._decode(block.stamps_ns, block.seqs, block.messages)
 
@@ -100,6 +103,8 @@ class _Track:
         none = np.empty(0, dtype=np.int64)
         stamps = np.concatenate([*self._stamps, none])
         values = np.concatenate([*self._columns, np.empty((0, len(self.paths)))])
+        # Joined once: who asks for `partial` again and again pays for what is new alone.
+        self._stamps, self._columns = [stamps], [values]
         steps = np.diff(stamps)
         if not len(stamps) or (steps > 0).all():
             # They came in order, each stamp once: nothing to sort, nothing to choose from.
@@ -212,6 +217,16 @@ class EpisodeBuilder:
         track = self._tracks[self.topic_map.clock_topic]
         stamps = track.ordered(self.start_ns, np.iinfo(np.int64).max).stamps
         return self.finish(int(stamps[-1]) if len(stamps) else self.start_ns, {})
+
+    @property
+    def settled_ns(self) -> int:
+        """Stamp up to which every topic that has begun has come; 0 before the first sample."""
+        newest = [track.newest_ns for track in self._tracks.values() if track.newest_ns]
+        return min(newest, default=0)
+
+    def settled(self) -> Episode:
+        """The episode up to `settled_ns`: samples that come in order do not change it."""
+        return self.finish(max(self.settled_ns, self.start_ns), {})
 
     def finish(
         self, end_ns: int, counts: Mapping[str, int], findings: Sequence[Finding] = ()

@@ -214,14 +214,15 @@ class CarryWatch:
         if self._reason or first >= self.n_steps:
             return self
         held, blind = carry_steps(episode)
-        rows = _Rows(episode, self._effector, self._objects, self._labels)
-        for step in _to_look_at(held, blind, first):
-            if held[step]:
-                if self._grip is None:
-                    self._grip = _Grip(_grasp(rows, step), step)
-                self._grip.take(rows, step)
-            elif not blind[step]:
-                self._end()
+        with np.errstate(over="ignore", invalid="ignore"):  # whatever a broken sensor says
+            rows = _Rows(episode, self._effector, self._objects, self._labels)
+            for step in _to_look_at(held, blind, first):
+                if held[step]:
+                    if self._grip is None:
+                        self._grip = _Grip(_grasp(rows, step), step)
+                    self._grip.take(rows, step)
+                elif not blind[step]:
+                    self._end()
         return self
 
     @property
@@ -297,7 +298,9 @@ class _Rows:
         phase = episode.phase if labels else None
         #: Name of the phase of each step, empty without phases.
         self.labels = (
-            [""] * len(episode) if phase is None else [labels.get(int(k), "") for k in phase]
+            [""] * len(episode)
+            if phase is None
+            else [labels.get(int(k), "") for k in np.nan_to_num(phase, nan=-1.0)]
         )
         try:
             self.is_open: list[bool] = (commanded(episode) > 0).tolist()

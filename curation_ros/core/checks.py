@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from curation_ros.core.alerts import lost_finding
+from curation_ros.core.carrying import carrying_of
 from curation_ros.core.errors import EpisodeError
 from curation_ros.core.findings import Finding
 from curation_ros.core.gripper import first_opening, is_closed_command, is_open_command
@@ -81,6 +83,7 @@ class Baseline:
             episode has none.
         starts_open_, closes_, opens_: 1 if all of them start with an open gripper, close it, and
             open it again; else 0.
+        carries_: 1 if none of them loses what it has grasped; else 0.
     """
 
     def fit(self, episodes: Iterable[Episode]) -> Self:
@@ -113,6 +116,7 @@ class Baseline:
         self.starts_open_ = int(bool(facts) and all(not f.starts_closed for f in facts))
         self.closes_ = int(bool(facts) and all(f.closes for f in facts))
         self.opens_ = int(bool(facts) and all(f.opening is not None for f in facts))
+        self.carries_ = int(bool(facts) and all(f.lost is None for f in facts))
         return self
 
     def fitted(self) -> dict[str, Any]:
@@ -140,6 +144,7 @@ class _Facts:
     closed: Mask
     opening: int | None
     held_s: float
+    lost: Finding | None
 
     @classmethod
     def of(cls, episode: Episode) -> _Facts:
@@ -173,6 +178,7 @@ class _Facts:
             held_s=(
                 0.0 if opening is None else float(times_s[opening] - times_s[int(closed.argmax())])
             ),
+            lost=lost_finding(carrying_of(episode).worst, episode),
         )
 
     @property
@@ -222,7 +228,11 @@ def check_episode(episode: Episode, baseline: Baseline | None = None) -> tuple[F
         _jump(episode, facts, recorded),
         *_task(episode, facts, baseline, spread),
     ]
-    return tuple(f for f in found if f is not None)
+    known = [f for f in found if f is not None]
+    if any(f.kind == "recording" or f.id == "jump" for f in (*episode.findings, *known)):
+        # Where a pose cannot be trusted, neither can what it shows of another.
+        known = [f for f in known if f.id not in ("object-lost", "not-carried")]
+    return tuple(known)
 
 
 # --- recording ------------------------------------------------------------------------------
@@ -397,6 +407,8 @@ def _task(
     if facts.has_gripper and not facts.closes and (baseline is None or baseline.closes_):
         text = "the gripper was never commanded to close"
         found.append(Finding("never-grasped", text, episode.span(0, last)))
+    if baseline is None or baseline.carries_:
+        found.append(facts.lost)
     if facts.opening is not None:
         text = ""
         limit = len(labels) - 1 if baseline is None else baseline.open_phase_

@@ -62,6 +62,8 @@ FINDINGS: dict[str, tuple[Kind, str]] = {
     "idle": ("motion", "the robot rests for long and then goes on"),
     "jump": ("motion", "the effector moves from one step to the next as no other step does"),
     "never-grasped": ("task", "the gripper was never commanded to close"),
+    "not-carried": ("task", "what the gripper closed on did not come along"),
+    "object-lost": ("task", "what was grasped left the effector before it was to be let go"),
     "opened-early": ("task", "the gripper opened before the task was at that point"),
     "unfinished": ("task", "the last phase or the release was never reached"),
 }

@@ -35,7 +35,7 @@ _BY_GRIPPER = ("clipped-start", "never-grasped", "opened-early", "unfinished")
 #: Refused references that are named; a mistake in a topic map is one of all of them.
 _SHOWN = 3
 #: Raised when the meaning of the state hash, or what an examination finds, changes.
-_STATE_VERSION = 2
+_STATE_VERSION = 3
 #: References are scored by scorers that were fitted without them; above this many, in groups.
 _MAX_FOLDS = 20
 

@@ -180,6 +180,16 @@ def phase_to_status(episode_id: str, label: str, index: int, progress: float) ->
     return Status(OK, "phase", label, episode_id, values)
 
 
+def alert_to_status(episode_id: str, name: str, finding: Finding) -> Status:
+    """Write an alert: what has just gone wrong, while the episode runs."""
+    values = {
+        "reason": finding.message,
+        "span_start": str(finding.span[0]),
+        "span_end": str(finding.span[1]),
+    }
+    return Status(ERROR, name, finding.id, episode_id, values)
+
+
 #: Level that a verdict is shown with.
 VERDICT_LEVEL = {"keep": OK, "salvage": WARN, "review": WARN, "discard": ERROR}
 

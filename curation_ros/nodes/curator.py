@@ -10,6 +10,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from diagnostic_msgs.srv import SelfTest
 from rclpy.node import Node
+from rclpy.time import Time
 from std_srvs.srv import Trigger
 
 from curation_ros.bags.cdr import CdrDecoder
@@ -21,7 +22,12 @@ from curation_ros.configuration import (
 )
 from curation_ros.core.decisions import Decision
 from curation_ros.core.errors import CurationError
-from curation_ros.core.status import counts_to_values, decision_to_status, event_from_status
+from curation_ros.core.status import (
+    alert_to_status,
+    counts_to_values,
+    decision_to_status,
+    event_from_status,
+)
 from curation_ros.core.stream import Sample
 from curation_ros.curating import Decided, LiveCuration
 from curation_ros.dataset import Dataset
@@ -64,6 +70,7 @@ class Curator(Node):
         self._recent: deque[DiagnosticStatus] = deque(map(_to_ros, known), _KEPT)
         self._latencies_ms: deque[float] = deque(maxlen=_KEPT)
         self._decided = self.create_publisher(DiagnosticArray, "curator/decision", DECISIONS)
+        self._alerted = self.create_publisher(DiagnosticArray, "curator/alert", EVENTS)
         # Before the data subscriptions: see the recorder.
         self.create_subscription(DiagnosticArray, "episode", self._on_episode, LATCHED)
         self.create_subscription(DiagnosticArray, "recorder/status", self._on_recorder, LATCHED)
@@ -157,6 +164,12 @@ class Curator(Node):
         """Nothing is open: every decision is on disk before it is published."""
 
     def _tell(self, decided: list[Decided]) -> None:
+        for alert in self._live.take_alerts():
+            status = status_to_ros(alert_to_status(alert.episode, alert.name, alert.finding))
+            message = DiagnosticArray(status=[status])
+            message.header.stamp = Time(nanoseconds=alert.seen_ns).to_msg()
+            self._alerted.publish(message)
+            self.get_logger().warning(f"{alert.finding.id} {alert.name}: {alert.finding.message}")
         for one in decided:
             began = time.perf_counter()
             self._publish(one.decision)

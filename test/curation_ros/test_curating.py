@@ -163,7 +163,7 @@ def test_decision_is_what_the_episode_deserves(dataset: Dataset) -> None:
     [early] = _watch(live, _early(), _stream_of("early"))
     assert (good.decision.verdict, good.decision.findings) == ("keep", ())
     assert early.decision.verdict == "discard"
-    assert [f.id for f in early.decision.findings] == ["opened-early"]
+    assert [f.id for f in early.decision.findings] == ["object-lost", "opened-early"]
     assert good.latency_s is not None
     assert good.latency_s > 0
     assert good.decision.scores["length"] == -240.0
@@ -417,7 +417,8 @@ def test_replay_gives_the_same_decision_and_no_second_line(dataset: Dataset) -> 
 def test_replayed_episodes_may_lie_at_the_same_time(dataset: Dataset) -> None:
     live = _curator(dataset)
     assert (_good().start_ns, len(_good())) == (_early().start_ns, len(_early()))
-    for name, verdict, found in (("good", "keep", []), ("early", "discard", ["opened-early"])) * 2:
+    failed = ["object-lost", "opened-early"]
+    for name, verdict, found in (("good", "keep", []), ("early", "discard", failed)) * 2:
         episode = {"good": _good, "early": _early}[name]()
         [decided] = _watch(live, episode, _stream_of(name), source="replay")
         assert decided.decision.verdict == verdict
@@ -749,3 +750,40 @@ def test_copy_that_is_played_live_is_found(dataset: Dataset) -> None:
     assert decided.decision.reason.startswith(f"duplicate: same content as episode {first.id}")
     record(dataset, copy)
     assert live.bag_closed(copy.id) == []  # equal to the bag, copy or not
+
+
+# --- alerts -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_loss_is_told_while_the_episode_runs(dataset: Dataset, seed: int) -> None:
+    """Whatever the order in which topics come; once; with the span that the decision has."""
+    live, episode = _curator(dataset), _early()
+    live.event(started(episode), 0.0)
+    alerts = []
+    for sample in _interleaved(_stream_of("early"), seed):
+        live.sample(sample, 0.0)
+        alerts += live.take_alerts()
+    [alert] = alerts
+    assert (alert.episode, alert.name) == (episode.id, episode.name)
+    [decided] = live.event(ended(episode), 0.0) + live.tick(DRAIN_S)
+    assert alert.finding == decided.decision.findings[0]
+    assert alert.finding.id == "object-lost"
+    assert "in LIFT" in alert.finding.message
+    left_ns = episode.start_ns + alert.finding.span[0]
+    assert 0 < alert.seen_ns - left_ns <= 0.3e9 + 1e9 * (seed > 0)
+    assert live.take_alerts() == []
+
+
+def test_a_good_episode_alarms_nobody(dataset: Dataset) -> None:
+    live = _curator(dataset)
+    _watch(live, _good(), _stream_of("good"))
+    assert live.take_alerts() == []
+
+
+def test_a_silent_pose_alarms_nobody(dataset: Dataset) -> None:
+    live, episode = _curator(dataset), _good()
+    stop_ns = episode.start_ns + 120 * 50_000_000
+    silent = [s for s in _stream_of("good") if s.topic != "eef_pose" or s.stamp_ns < stop_ns]
+    _watch(live, episode, silent)
+    assert live.take_alerts() == []

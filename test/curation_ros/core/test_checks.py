@@ -125,9 +125,15 @@ def test_early_release_is_a_failed_task_and_no_fault_of_the_recording(
     open_at = int(rng.integers(CLOSE_AT + GRASP_STEPS, CLOSE_AT + GRASP_STEPS + 50))
     episode = make_episode(rng, TASK_STEPS + 260, task_steps=TASK_STEPS, open_at=open_at)
     for found in (check_episode(episode), check_episode(episode, baseline)):
-        assert [f.id for f in found] == ["opened-early"]
-        assert found[0].kind == "task"
-        assert found[0].span == episode.span(open_at, open_at)
+        assert [f.id for f in found[1:]] == ["opened-early"]
+        # Opened as it begins to lift, it was never taken along.
+        assert found[0].id in ("object-lost", "not-carried")
+        assert {f.kind for f in found} == {"task"}
+        assert found[1].span == episode.span(open_at, open_at)
+        # It begins to leave within 0.15 s, and that is sure within 0.3 s.
+        first, last = found[0].span
+        assert 0 <= first - found[1].span[0] <= 0.15e9
+        assert 0 < last - first <= 0.3e9
         assert untrustworthy(found) == []
 
 
@@ -141,7 +147,7 @@ def test_findings_come_in_the_order_of_the_list() -> None:
     episode = _set(make_episode(open_at=140), "phase", slice(0, 5), 1.0)
     episode = _set(_padded(episode, 30), "eef_position", 150, 5.0)
     ids = _ids(episode)
-    assert ids == ["clipped-start", "padded-tail", "jump", "opened-early"]
+    assert ids == ["clipped-start", "padded-tail", "jump", "opened-early"]  # no pose is trusted
     assert ids == sorted(ids, key=list(FINDINGS).index)
     assert [f.kind for f in check_episode(episode)] == ["recording"] * 2 + ["motion", "task"]
 
