@@ -230,21 +230,16 @@ def _compare(rows: list[Row]) -> None:
         if not row["scorer"] or row["rate"] is None:
             continue
         own = set(row["needs"]) - _FREE
-        rivals = [
-            r
-            for r in same
-            if r["rate"] is not None
-            and not r["scorer"]
-            and set(r["needs"]) - _FREE <= own
-            and r["set"] != row["set"]
-        ]
+        # The best of many draws is luck: those of one number kept count as one row, their mean.
+        rivals: dict[str, list[float]] = {}
+        for r in same:
+            if r["rate"] is not None and not r["scorer"] and r["set"] != row["set"]:
+                if set(r["needs"]) - _FREE <= own:
+                    rivals.setdefault(r["row"].partition("#")[0], []).append(r["rate"])
         if rivals:
-            rival = max(rivals, key=lambda r: r["rate"])
-            row["rival"] = {
-                "row": rival["row"],
-                "rate": rival["rate"],
-                "difference": row["rate"] - rival["rate"],
-            }
+            rival = max(rivals, key=lambda name: mean(rivals[name]))
+            rate = mean(rivals[rival])
+            row["rival"] = {"row": rival, "rate": rate, "difference": row["rate"] - rate}
 
 
 def _correlations(rows: Sequence[Row]) -> Iterable[Row]:

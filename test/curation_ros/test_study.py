@@ -142,6 +142,7 @@ def test_rivals_need_no_more_than_the_scorer(found: dict[str, Any]) -> None:
         if row["rival"] is None:
             continue
         rival = rows_of(found)[row["rival"]["row"]]
+        assert "#" not in rival["row"]
         assert set(rival["needs"]) - {"nothing", "dataset"} <= set(row["needs"])
         assert not rival["scorer"]
 
