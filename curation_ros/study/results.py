@@ -233,9 +233,9 @@ def _compare(rows: list[Row]) -> None:
         # The best of many draws is luck: those of one number kept count as one row, their mean.
         rivals: dict[str, list[float]] = {}
         for r in same:
-            if r["rate"] is not None and not r["scorer"] and r["set"] != row["set"]:
-                if set(r["needs"]) - _FREE <= own:
-                    rivals.setdefault(r["row"].partition("#")[0], []).append(r["rate"])
+            counts = r["rate"] is not None and not r["scorer"] and r["set"] != row["set"]
+            if counts and set(r["needs"]) - _FREE <= own:
+                rivals.setdefault(r["row"].partition("#")[0], []).append(r["rate"])
         if rivals:
             rival = max(rivals, key=lambda name: mean(rivals[name]))
             rate = mean(rivals[rival])
