@@ -55,7 +55,7 @@ def unknown_phase(take: Take) -> Take:
 #: Name -> (take, findings that it must have).
 TAKES = {
     "clean": (lambda: libero_take(1), set()),
-    "early_release": (lambda: libero_take(2, open_at=70), {"opened-early"}),
+    "early_release": (lambda: libero_take(2, open_at=70), {"object-lost", "opened-early"}),
     "repeated": (lambda: repeated(libero_take(3)), set()),
     "interleaved": (lambda: interleaved(libero_take(4), np.random.default_rng(0)), set()),
     "no_counts": (lambda: libero_take(5, counts=False), set()),
