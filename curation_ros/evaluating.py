@@ -17,6 +17,9 @@ from curation_ros.processes import Domain, Nodes
 
 # A step takes milliseconds; with this much silence something hangs.
 _SILENCE_S = 120.0
+# What the transport has lost comes again after 3 s, on a busy machine a second time. A node that
+# has ended is noticed at once.
+_ANSWER_S = 15.0
 
 
 def evaluate_on_graph(
@@ -62,6 +65,7 @@ def evaluate_on_graph(
                     "task": "rollout",
                     "max_steps": max_steps,
                     "steps_after_success": 0,
+                    "command_timeout_s": _ANSWER_S,
                     "dataset": folder,
                     "wait_for": ["policy_node"],
                 },

@@ -217,7 +217,8 @@ class Driver:
                 after = self._p["steps_after_success"]
                 if run.success_step is not None and run.executed > run.success_step + after:
                     break
-                yield True
+                if run.controller is not None or self._p["sync"] == "free":
+                    yield True  # who waits for commands yields there
             run.reason = ""
         except (AbortedError, SimError) as err:
             run.reason = str(err)

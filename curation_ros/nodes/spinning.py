@@ -68,6 +68,7 @@ def run(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
         while not stopping:
             busy = node.work()  # type: ignore[attr-defined]
             executor.spin_once(timeout_sec=0.0 if busy else _IDLE_S)
+            take_waiting(node)
         executor.remove_node(node)
     except Finished:
         pass
@@ -79,6 +80,21 @@ def run(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
             node.destroy_node()
         rclpy.try_shutdown()  # type: ignore[attr-defined]
     return 0
+
+
+def take_waiting(node: Node) -> None:
+    """Serve what has come meanwhile, at most one message a subscription.
+
+    The executor builds a new wait set for every message or two, which takes some 0.3 ms; to take
+    a message, or to find that there is none, takes microseconds. The order is the executor's own:
+    that in which subscriptions were created. Raw ones are those whose callbacks take message info.
+    """
+    for subscription in list(node.subscriptions):
+        with subscription.handle:
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        if taken is not None:
+            message, info = taken
+            subscription.callback(*((message, info) if subscription.raw else (message,)))
 
 
 def _complain(problem: object) -> int:
