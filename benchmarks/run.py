@@ -15,6 +15,7 @@ BENCHMARKS = (
     "sim_speed",
     "decoding",
     "graph_speed",
+    "lockstep",
     "decision_latency",
     "recorder_loss",
     "kill_cost",
