@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from curation_ros.cli.arguments import add_workers
-from curation_ros.cli.output import percent, print_json, say
+from curation_ros.cli.output import percent, print_json, progress_console, say
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.evaluating import evaluate_on_graph, summary
 from curation_ros.workers import spread
@@ -56,6 +56,9 @@ def run(args: argparse.Namespace) -> int:
 def _rollouts(args: argparse.Namespace, policy: Any) -> Iterator[dict[str, Any]]:
     if args.graph:
         logs = args.logs or Path(tempfile.mkdtemp(prefix="curation_ros-logs-"))
+        if progress_console.is_terminal:  # it takes some seconds until the first row
+            text = f"starting sim_node and policy_node, their logs are in {logs}"
+            progress_console.print(text, markup=False, soft_wrap=True)
         yield from evaluate_on_graph(
             args.policy, policy.id, args.starts, max_steps=args.max_steps, log_folder=logs
         )
