@@ -194,7 +194,7 @@ def test_base_requirements_are_light():
     extras = {e for r in requirements for e in re.findall(r"extra == ['\"](\w+)", r)}
     assert base
     assert [r for r in base if HEAVY.match(r)] == []
-    assert extras == {"ros", "sim", "policy", "ray", "dask", "parquet", "test"}
+    assert extras == {"ros", "sim", "policy", "report", "ray", "dask", "parquet", "test"}
     # Where apt has installed ROS, no other extra brings a second rclpy.
     ros = [r for r in requirements if re.match(r"ros-|rclpy", r)]
     assert ros
