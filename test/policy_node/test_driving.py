@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import shutil
@@ -189,7 +190,12 @@ def running(folder, tmp_path):
     words = [sys.executable, "-m", "curation_ros.cli.main", "evaluate", "--graph"]
     words += ["--policy", str(folder), "--starts", "generated:5:8", "--logs", str(tmp_path)]
     with subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        words,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Whoever runs the tests in the background has them ignore it.
+        preexec_fn=functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
     ) as process:
         first = process.stdout.readline()
         assert first.startswith("generated-5-000: success after "), process.communicate()

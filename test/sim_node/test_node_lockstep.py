@@ -43,6 +43,16 @@ def lockstep(graph):
     # Who is waited for listens to the episodes, too.
     commander.node.create_subscription(DiagnosticArray, "episode", lambda _: None, LATCHED)
     graph._executor.add_node(commander.node)
+    graph.until(
+        lambda: (
+            min(
+                commander.twist.get_subscription_count(),
+                commander.gripper.get_subscription_count(),
+            )
+            == 2
+        ),
+        "sim and recorder hear the commander",
+    )
     yield Lockstep(graph, dataset, commander, seen)
     graph._executor.remove_node(commander.node)
     commander.close()
@@ -58,21 +68,26 @@ class Lockstep:
         self.commander = commander
         self.seen = seen
         self.last_ns = 0
+        self.how = None
         self.n = 0
 
     def observation(self):
-        """The next observation; one that comes again, as on a slow machine, is passed over."""
+        """The next observation; one that comes again was not answered in time: it is again."""
         while True:
             self.graph.until(lambda: self.seen, "an observation")
             found = self.seen.pop(0)
             if stamp_ns(found) > self.last_ns:
                 self.last_ns = stamp_ns(found)
                 return found
+            if self.how is not None and stamp_ns(found) == self.last_ns:
+                self.commander.say(found, **self.how)
 
     def answer(self, steps, **how):
         """Answer so many observations."""
         for _ in range(steps):
-            self.commander.say(self.observation(), **how)
+            found = self.observation()
+            self.how = how
+            self.commander.say(found, **how)
 
     def end(self):
         """The event that ends the running episode, and its bag."""
