@@ -19,8 +19,7 @@ _BLINDING = ("clock-back", "duplicate-stamp", "gap", "not-finite", "undecodable"
 class AlertWatch:
     """Looks at an episode as it grows, and says once what the operator must know now.
 
-    Invariant: it says of a growing episode what `lost_finding` says of the whole one; only
-    sooner.
+    Invariant: it says the same of an episode that grows as of the whole one at once; only sooner.
 
     Args:
         topic_map: of the episode.
@@ -55,7 +54,7 @@ def lost_finding(hold: Hold | None, episode: Episode) -> Finding | None:
     """That an object was lost, or left behind: its phase and time in the message.
 
     Args:
-        hold: as `CarryWatch.lost` or `Carrying.worst` gives it; any state.
+        hold: as `CarryWatch.lost` gives it; any state.
         episode: of the hold.
 
     Returns:

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from curation_ros.core.alerts import lost_finding
-from curation_ros.core.carrying import carrying_of
+from curation_ros.core.alerts import AlertWatch
 from curation_ros.core.errors import EpisodeError
 from curation_ros.core.findings import Finding
 from curation_ros.core.gripper import first_opening, is_closed_command, is_open_command
@@ -178,7 +177,7 @@ class _Facts:
             held_s=(
                 0.0 if opening is None else float(times_s[opening] - times_s[int(closed.argmax())])
             ),
-            lost=lost_finding(carrying_of(episode).worst, episode),
+            lost=AlertWatch(episode.topic_map).take(episode),
         )
 
     @property
