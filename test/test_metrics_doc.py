@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import re
 from pathlib import Path
 from types import ModuleType
 
@@ -42,7 +41,7 @@ def test_document_has_every_scorer_parameter_mode_finding_and_rule(generator: Mo
         section = document[start : document.index("When it lies", start)]
         for parameter in kind().params():
             assert f"| `{parameter}` |" in section, (name, parameter)
-        assert re.search(r"\*\*Cost\*\*: (\d+ µs an episode of 350 steps|not measured)", section)
+        assert "µs an episode of 350 steps" in section
     for name in (*MODES, *FINDINGS, *KEEP_RULES):
         assert f"| `{name}` |" in document, name
     for name in RULES:
