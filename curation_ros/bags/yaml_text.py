@@ -31,6 +31,8 @@ def load_yaml(text: str | bytes) -> Any:
             _check_nesting(text)
         data = yaml.load(text, Loader=_LOADER)  # a safe loader, either way
     except yaml.YAMLError as err:
+        if "increasing flow level" in str(err):  # libyaml counts these itself from 0.2.6 on
+            raise ValueError(f"not metadata: nested more than {MOST_NESTED} deep") from err
         raise ValueError(f"not YAML: {str(err).splitlines()[0]}") from err
     if b"*" in raw:
         _check_unfolded(data)

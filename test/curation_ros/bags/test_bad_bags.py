@@ -271,7 +271,7 @@ def test_every_finding_of_an_error_is_in_the_list() -> None:
 def test_yaml_that_is_a_trap_is_refused(text: str) -> None:
     """Some of these overflow the stack of libyaml, which ends the process."""
     for form in (text, text.encode()):
-        with pytest.raises(ValueError, match=r"not (metadata|YAML)"):
+        with pytest.raises(ValueError, match="not metadata"):
             load_yaml(form)
 
 
