@@ -78,6 +78,17 @@ def run(args: argparse.Namespace) -> int:
             work=not args.dry_run,
         )
     if args.dry_run:
+        wanted = {policy for cell in study.cells for policy in cell.policies.values()}
+        trained = {row["policy"] for row in study.judge.rows("policy") if row["status"] == "ok"}
+        rolled = sum(row["status"] == "ok" for row in study.judge.rows("rollout"))
+        if args.json:
+            print_json(
+                {"policies": len(wanted), "trained": len(wanted & trained), "rollouts": rolled}
+            )
+        else:
+            say(
+                f"{len(wanted & trained)} of {len(wanted)} policies and {rolled} rollouts are done"
+            )
         return _DONE
     found = results(study)
     path = folder / "results.json"

@@ -231,7 +231,11 @@ def test_rollout_that_is_given_up_is_no_failure_of_the_policy(running):
     """A policy node that hangs: the sim gives up after its patience of 15 s."""
     pids = running.nodes
     os.kill(pids["policy_node"], signal.SIGSTOP)
-    time.sleep(17.0)  # it must run again to be stopped in good order
+    log, deadline_s = running.logs / "sim_node.log", time.monotonic() + 60.0
+    while "no answer on command/twist" not in log.read_text():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.1)
+    # It must run again to be stopped in good order.
     os.kill(pids["policy_node"], signal.SIGCONT)
     code, err = running.ends()
     assert code == 3
@@ -285,7 +289,7 @@ def other_phases(card):
 )
 @pytest.mark.parametrize("how", [["--graph"], []])
 def test_policy_that_does_not_fit_is_one_line_and_no_process(
-    folder, tmp_path, capsys, monkeypatch, change, said, how
+    folder, tmp_path, capsys, change, said, how
 ):
     spoiled = tmp_path / "policy"
     if change is not None:
@@ -293,10 +297,11 @@ def test_policy_that_does_not_fit_is_one_line_and_no_process(
         card = json.loads((spoiled / "card.json").read_text())
         change(card)
         (spoiled / "card.json").write_text(json.dumps(card))
-    monkeypatch.setattr(subprocess, "Popen", None)  # it is refused before anything is started
-    code = curation(["evaluate", "--policy", str(spoiled), *how])
+    logs = tmp_path / "logs"
+    code = curation(["evaluate", "--policy", str(spoiled), "--logs", str(logs), *how])
     out, err = capsys.readouterr()
     assert (code, out) == (3, "")
     assert err.startswith("error: ")
     assert said in err
     assert len(err.splitlines()) == 1
+    assert not logs.exists()  # no node was started
