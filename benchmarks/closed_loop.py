@@ -30,6 +30,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from one_core import rows_of
 
 from curation_ros.bags.reader import read_episode
 from curation_ros.collecting import Collection, collect
@@ -425,11 +426,7 @@ def measure(dataset: Path | None, parts: Sequence[str]) -> Iterator[dict[str, An
 
 def run() -> list[dict[str, Any]]:
     """Measure in a process of its own, with one thread on one core, and return its rows."""
-    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    done = subprocess.run(
-        [sys.executable, __file__], env={**os.environ, **one}, check=True, stdout=subprocess.PIPE
-    )
-    return [json.loads(line) for line in done.stdout.splitlines()]
+    return rows_of(__file__)
 
 
 if __name__ == "__main__":

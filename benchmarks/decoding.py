@@ -11,8 +11,6 @@ import functools
 import json
 import os
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -25,6 +23,7 @@ import mcap_ros2_support_fast.decoder
 import numpy as np
 import numpy.typing as npt
 from mcap.reader import make_reader
+from one_core import rows_of
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
@@ -487,11 +486,7 @@ def measure(n_rounds: int = N_ROUNDS) -> list[dict[str, Any]]:
 
 def run() -> list[dict[str, Any]]:
     """Measure in a process of its own, with one thread on one core, and return its rows."""
-    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    done = subprocess.run(
-        [sys.executable, __file__], env={**os.environ, **one}, check=True, stdout=subprocess.PIPE
-    )
-    return [json.loads(line) for line in done.stdout.splitlines()]
+    return rows_of(__file__)
 
 
 if __name__ == "__main__":

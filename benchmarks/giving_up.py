@@ -1,6 +1,6 @@
 """How often a rollout that is given up as lost would have succeeded after all.
 
-    python benchmarks/giving_up.py [--policies N] [--starts N]
+    python benchmarks/giving_up.py [--starts N] [--jobs N]
 
 Policies of all kinds (trained on everything, on few, on half bad demonstrations, with and without
 fingers) are rolled out in full while `policy_node.rollouts.GiveUp` only watches. Ratios are of
@@ -93,7 +93,7 @@ def measure(n_starts: int, jobs: int) -> list[dict[str, Any]]:
 def main() -> None:
     """Print what was found."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--starts", type=int, default=25, help="for each of the 12 policies")
+    parser.add_argument("--starts", type=int, default=20, help="for each of the 12 policies")
     parser.add_argument("--jobs", type=int, default=-1)
     args = parser.parse_args()
     rows = measure(args.starts, args.jobs)

@@ -16,21 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from curation_ros.auditing import PAPER
 from curation_ros.bags.reader import read_episode
 from curation_ros.core.episode import Episode
 from curation_ros.core.scorers import SCORERS, Scorer
 
 COMMAND = "python benchmarks/run.py scorer_cost"
 N_STEPS = 350
-_PAPER = (
-    "smoothness",
-    "entropy",
-    "gripper_timing",
-    "isolation_forest",
-    "ensemble",
-    "knn",
-    "trajectory_alignment",
-)
 _N_FITTED, _N_SCORED, _N_PASSES = 50, 50, 15
 _SAMPLE = Path(__file__).resolve().parents[1] / "bags" / "sample"
 
@@ -73,7 +65,7 @@ def run() -> list[dict[str, Any]]:
     made = episodes(_N_FITTED + _N_SCORED, np.random.default_rng(0))
     fitted = {name: kind().fit(made[:_N_FITTED]) for name, kind in SCORERS.items()}
     scored = made[_N_FITTED:]
-    paper = [fitted[name] for name in _PAPER]
+    paper = [fitted[name] for name in PAPER if name in SCORERS]
     costs = {f"cost of {name}": cost_us([scorer], scored) for name, scorer in fitted.items()}
     costs["cost of the seven scorers of the paper"] = cost_us(paper, scored)
     return [

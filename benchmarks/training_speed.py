@@ -10,8 +10,6 @@ from __future__ import annotations
 import json
 import os
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from one_core import rows_of
 from torch.utils.data import DataLoader, TensorDataset
 
 from curation_ros.bags.reader import read_episode
@@ -195,11 +194,7 @@ def measure(n_rounds: int = N_ROUNDS) -> list[dict[str, Any]]:
 
 def run() -> list[dict[str, Any]]:
     """Measure in a process of its own, with one thread on one core, and return its rows."""
-    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    done = subprocess.run(
-        [sys.executable, __file__], env={**os.environ, **one}, check=True, stdout=subprocess.PIPE
-    )
-    return [json.loads(line) for line in done.stdout.splitlines()]
+    return rows_of(__file__)
 
 
 if __name__ == "__main__":
