@@ -71,12 +71,12 @@ class GiveUp:
 
     `lost`: the object lies on the table, at rest, out of reach of the gripper and off the goal, in
     a phase from which the phases never lead back to a grasp. `phase`: the policy has been in one
-    phase for more than twice as long as any demonstration; a success after that counts as a
+    phase for twice as long as the slowest demonstration; a success after that counts as a
     failure, as one after `max_steps` does. `benchmarks/giving_up.py` counts how often either rule
     is wrong. For one rollout.
     """
 
-    #: Steps in one phase; demonstrations take up to 70 in one, and succeed 4 steps into RELEASE.
+    #: Steps in one phase; demonstrations take up to 100 in one, and succeed 4 steps into RELEASE.
     PHASE_STEPS, RELEASE_STEPS = 200, 60
     _REST_STEPS, _REST_M = 20, 1e-3
     _ON_TABLE_M, _OUT_OF_REACH_M, _OFF_GOAL_M = 0.02, 0.12, 0.06
