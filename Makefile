@@ -1,4 +1,4 @@
-# make demo    the whole path in front of you: record, score, decide, train, drive (6 minutes)
+# make demo    the whole path in front of you: record, score, decide, train, drive (5 minutes)
 # make test    checks and tests, as CI runs them
 # make docs    docs/metrics.md anew, from the code
 # make bench   the benchmarks (half an hour)

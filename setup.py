@@ -9,6 +9,11 @@ from pathlib import Path
 
 from setuptools import find_packages, setup
 
+try:
+    from setuptools.command.develop import develop
+except ImportError:  # newer than any that colcon can use
+    develop = object
+
 PACKAGE = "curation_ros"
 NODES = ("sim_node", "recorder", "curator", "policy_node", "replay")
 EXECUTABLES = {
@@ -17,6 +22,19 @@ EXECUTABLES = {
 }
 # Not imported: nothing is installed yet. package.xml repeats the version, and a test compares.
 VERSION = re.findall(r'__version__ = "(.+)"', Path(PACKAGE, "__init__.py").read_text("utf-8"))[0]
+# colcon writes the path of its own Python into programs, which with apt is the system's; so
+# they run on the virtual environment that is active, where pip has put the requirements.
+ACTIVE_PYTHON = "/usr/bin/env python3"
+
+
+class Develop(develop):
+    """What colcon build --symlink-install runs; it heeds no option of build_scripts."""
+
+    def write_script(self, script_name, contents, *args, **kwargs):
+        """Write a program that starts the Python that is active."""
+        code = contents.partition("\n")[2]
+        super().write_script(script_name, f"#!{ACTIVE_PYTHON}\n{code}", *args, **kwargs)
+
 
 setup(
     name=PACKAGE,
@@ -35,8 +53,8 @@ setup(
         (f"share/{PACKAGE}/config", glob("config/*.yaml")),
         (f"lib/{PACKAGE}", sorted(glob("libexec/*"))),
     ],
-    # The floors are the versions of Ubuntu 24.04, so that pip leaves alone the NumPy that the
-    # messages of ROS 2 Jazzy from apt are compiled for.
+    # The floors are the versions of Ubuntu 24.04: the messages of ROS 2 Jazzy from apt are
+    # compiled for its NumPy (the README has pip keep it, by 'numpy<2').
     install_requires=[
         "joblib>=1.4",
         "lz4",
@@ -80,7 +98,6 @@ setup(
     },
     zip_safe=False,
     entry_points={"console_scripts": [f"{k} = {v}" for k, v in EXECUTABLES.items()]},
-    # colcon writes the path of its own Python into programs, which with apt is the system's; so
-    # they run on the virtual environment that is active, where pip has put the requirements.
-    options={"build_scripts": {"executable": "/usr/bin/env python3"}},
+    cmdclass={} if develop is object else {"develop": Develop},
+    options={"build_scripts": {"executable": ACTIVE_PYTHON}},
 )

@@ -501,7 +501,7 @@ def _notes(
     elif differ:
         notes.append(f"the labels {other!r} differ on {differ} of {len(both)} episodes")
     else:
-        notes.append(f"the labels {other!r} are the same on all {len(both)} episodes")
+        notes.append(f"the labels {other!r} say the same of all {len(both)} episodes")
     control = facts["length_control"]
     if control["mode"] == "none":
         notes.append("length is not controlled: raw and controlled are the same")

@@ -12,6 +12,7 @@ import yaml
 from curation_ros.bags.reader import find_bags, read_episode
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import ConfigError
+from curation_ros.core.rules import RULES, NoRule
 from curation_ros.core.scoring import Curation
 from curation_ros.core.topic_map import TopicMap, read_topic_map
 
@@ -25,6 +26,7 @@ _KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "length_value": ((int, float, type(None)), "a number"),
     "scorer_params": (dict, "a mapping"),
     "rule_params": (dict, "a mapping"),
+    "salvage_margin_s": ((int, float, type(None)), "a number of seconds, or null"),
 }
 _DEFAULTS = inspect.signature(Curation).parameters
 
@@ -58,8 +60,8 @@ def read_curation(config: Path | None, overrides: Mapping[str, Any]) -> Curation
 
     Args:
         config: `config/curation.yaml` or one like it; None takes the defaults.
-        overrides: keywords of Curation that win over the file; empty values do not. The scorer
-            that decides is added to `scorers` that lack it.
+        overrides: keywords of Curation that win over the file; empty values do not. Scorers
+            that decide are added to `scorers` that lack them.
 
     Raises:
         ConfigError: naming file and key.
@@ -74,8 +76,10 @@ def read_curation(config: Path | None, overrides: Mapping[str, Any]) -> Curation
         names = list(settings.get("scorers", _DEFAULTS["scorers"].default))
         if settings.get("rule") == "none" and "rule_scorer" not in given:
             settings["rule_scorer"] = names[0]  # nothing decides
+        rule = RULES.get(settings.get("rule", _DEFAULTS["rule"].default), NoRule)
         decides = settings.get("rule_scorer", _DEFAULTS["rule_scorer"].default)
-        settings["scorers"] = [*names, *(n for n in [decides] if n not in names)]
+        asked = [*rule.consults, decides]
+        settings["scorers"] = [*names, *(n for n in asked if n not in names)]
     try:
         return Curation(**settings)
     except ConfigError as err:

@@ -18,6 +18,7 @@ from curation_ros.core.errors import CurationError, EpisodeError
 from curation_ros.core.findings import Finding
 from curation_ros.core.gate import Closed, EpisodeGate
 from curation_ros.core.judgement import Ruling
+from curation_ros.core.salvage import LEAST_PREFIX_S
 from curation_ros.core.scoring import Curation
 from curation_ros.core.status import EpisodeEvent, owner_findings
 from curation_ros.core.stream import NS_PER_S, Decoder, Sample
@@ -27,8 +28,8 @@ from curation_ros.examining import EpisodesOf, Examiner, judge_bags, with_copy
 
 #: An episode that runs is looked at for alerts this often, by its own clock.
 ALERT_PERIOD_S = 0.1
-#: Verdicts that a person may give; to salvage needs a span, which only a scorer knows.
-OVERRIDES = ("keep", "discard", "review")
+#: Verdicts that a person may give; to salvage, a person must say until when.
+OVERRIDES = ("keep", "salvage", "discard", "review")
 #: Episodes whose live form is kept until their bags close.
 _REMEMBERED = 8
 
@@ -121,7 +122,8 @@ class LiveCuration:
                 name=event.name,
                 start_ns=event.start_ns,
             )
-            self._live[event.id] = _Live(builder, event, AlertWatch(self.topic_map))
+            watch = AlertWatch(self.topic_map, usual=self.curation.baseline_.usual_)
+            self._live[event.id] = _Live(builder, event, watch)
             for sample in early:
                 builder.push(sample)
         return self.tick(now_s)
@@ -283,7 +285,7 @@ class LiveCuration:
 
         Args:
             prefix: id, beginning of an id, or short name.
-            verdict: keep, discard or review.
+            verdict: keep, discard or review; to salvage, see the function `override`.
             reason: in the person's words; may be empty.
             by: who decided.
 
@@ -365,23 +367,65 @@ def log_decision(dataset: Dataset, decision: Decision) -> Decision:
 
 
 def override(
-    dataset: Dataset, prefix: str, verdict: str, reason: str, by: str, state_hash: str
+    dataset: Dataset,
+    prefix: str,
+    verdict: str,
+    reason: str,
+    by: str,
+    state_hash: str,
+    *,
+    until_s: float | None = None,
 ) -> Decision:
     """Log a person's decision on an episode as a new revision.
 
+    Args:
+        dataset: it has the episode.
+        prefix: id, beginning of an id, or short name.
+        verdict: one of OVERRIDES.
+        reason: in the person's words; may be empty.
+        by: who decided.
+        state_hash: of the curation in use, where nothing was decided before.
+        until_s: of what is salvaged, where the part that is kept ends, seconds from the start of
+            the episode; None for the other verdicts.
+
     Raises:
-        EpisodeError: if the episode is not known or the verdict is none of OVERRIDES.
+        EpisodeError: if the episode is not known, the verdict is none of OVERRIDES, or `until_s`
+            does not fit the verdict or the episode.
     """
+    what = f"override {verdict!r} of {prefix!r}"
     if verdict not in OVERRIDES:
-        raise EpisodeError(f"override {verdict!r} of {prefix!r}: expected {', '.join(OVERRIDES)}")
+        raise EpisodeError(f"{what}: expected {', '.join(OVERRIDES)}")
+    if verdict == "salvage" and until_s is None:
+        raise EpisodeError(f"{what}: until when is not said (curation override ... --until does)")
+    if verdict != "salvage" and until_s is not None:
+        raise EpisodeError(f"{what}: until {until_s} s: only what is salvaged is kept until then")
     episode_id = dataset.find(prefix)
     known = dataset.decisions(episode_id)
     previous = known[-1] if known else _undecided(dataset, episode_id, state_hash)
     text = f"{by}: {reason}" if reason else f"{by} decided"
+    span = whole = (0, _duration_ns(dataset, previous, known))
+    if until_s is not None:
+        whole_s = whole[1] / NS_PER_S
+        if not LEAST_PREFIX_S <= until_s < whole_s:  # NaN is refused, too
+            raise EpisodeError(
+                f"{what}: until {until_s} s: expected from {LEAST_PREFIX_S:g} s to less than "
+                f"{whole_s:.2f} s, which is all of it"
+            )
+        span = (0, round(until_s * NS_PER_S))
+        text += f"; kept until {until_s:.2f} s of {whole_s:.2f} s"
     verdict_: Any = verdict
-    logged = dataset.append_decision(decisions.override(previous, verdict_, text, by=by))
+    decision = decisions.override(previous, verdict_, text, by=by, span=span)
+    logged = dataset.append_decision(decision)
     assert logged is not None, "nothing was said that would stop it"
     return logged
+
+
+def _duration_ns(dataset: Dataset, previous: Decision, known: Sequence[Decision]) -> int:
+    """How long an episode is: as its bag says, or as far as anybody has decided on it."""
+    query = "SELECT end_ns - start_ns AS ns FROM episodes WHERE id = ?"
+    said = [row["ns"] for row in dataset.rows(query, (previous.episode,))]
+    ends_ns = [*(int(ns) for ns in said), *(d.span[1] for d in known), previous.span[1]]
+    return max(ends_ns)
 
 
 def _undecided(dataset: Dataset, episode_id: str, state_hash: str) -> Decision:

@@ -19,7 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from curation_ros.bags.reader import Bag, open_bag
+from curation_ros.bags.reader import Bag, episode_of, open_bag
 from curation_ros.bags.writer import sync_folder
 from curation_ros.core.decisions import Decision, in_force
 from curation_ros.core.errors import BagError, CurationError, EpisodeError
@@ -389,12 +389,16 @@ def _bag_row(bag: Bag, episode_id: str) -> tuple[object, ...]:
     event = bag.event()
     if event is None:
         raise EpisodeError(f"bag {bag.path}: no 'episode' in its custom data: not of our recorder")
+    end_ns = event.end_ns
+    if end_ns is None:  # the recorder died before it was said
+        with suppress(CurationError):
+            end_ns = int(episode_of(bag).stamps_ns[-1])
     return (
         episode_id,
         event.name,
         f"episodes/{episode_id}",
         event.start_ns,
-        event.end_ns or event.start_ns,
+        end_ns or event.start_ns,
         event.event,
         event.source,
         int(bag.custom_data.get("recovered") == "true"),

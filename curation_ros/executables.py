@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
+import signal
 import sys
 from functools import partial
 
@@ -14,9 +16,14 @@ _OF_SIM = ("libero", "llvmlite", "mujoco", "numba", "robosuite")
 
 
 def _run(node: str) -> int:
+    # Who is stopped while it is still importing, which takes seconds, has nothing to tidy up.
+    signal.signal(signal.SIGINT, lambda *_: os._exit(0))
     try:
         module = importlib.import_module(NODE_MODULES[node])
-    except ModuleNotFoundError as err:
+    except ImportError as err:
+        if not isinstance(err, ModuleNotFoundError):  # it is there, and does not load
+            print(f"error: {node}: {str(err).partition(chr(10))[0]}", file=sys.stderr)  # noqa: T201
+            return _WRONG_SETUP
         missing = str(err.name).partition(".")[0]
         if importlib.util.find_spec("rclpy") is None:
             remedy = (

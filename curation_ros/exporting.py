@@ -16,7 +16,7 @@ from curation_ros.bags.writer import sync_folder
 from curation_ros.core.decisions import CURATOR, Decision, in_force
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.scorers import SCORERS
-from curation_ros.core.selection import Entry, Manifest
+from curation_ros.core.selection import Entry, Manifest, Span
 from curation_ros.core.stream import NS_PER_S
 from curation_ros.dataset import Dataset
 from curation_ros.selecting import read_manifest
@@ -24,7 +24,7 @@ from curation_ros.selecting import read_manifest
 #: Format -> what it holds. The only list; the command line is made from it.
 FORMATS: dict[str, str] = {
     "keep-json": 'the kept episodes alone: {"episodes": [id, ...], "names", "spans", ...}',
-    "csv": "a row an episode, kept or not",
+    "csv": "a row an episode, kept or not; span_* is the decision's, selected_spans what is kept",
     "parquet": "the same as csv, typed; needs the extra 'parquet'",
 }
 #: Columns of a row and their types, before one column `score/<scorer>` for each scorer.
@@ -38,6 +38,7 @@ COLUMNS: dict[str, type] = {
     "span_start_ns": int,
     "span_end_ns": int,
     "selected": bool,
+    "selected_spans": str,
     "steps": int,
     "duration_s": float,
     "findings": str,
@@ -78,7 +79,9 @@ def export(
     decided = dataset.latest_decisions()
     manifest = _manifest(dataset, selection) if selection else None
     entries = manifest.entries if manifest is not None else _kept(decided)
-    selected = {entry.episode for entry in entries}
+    selected: dict[str, list[Span | None]] = {}
+    for entry in entries:
+        selected.setdefault(entry.episode, []).append(entry.span)
     if file_format == "keep-json":
         if manifest is None and not decided:
             raise CurationError(
@@ -145,7 +148,7 @@ def rows_of(
     dataset: Dataset,
     names: Mapping[str, str],
     decided: Mapping[str, Decision],
-    selected: set[str],
+    selected: Mapping[str, Sequence[Span | None]],
 ) -> list[dict[str, Any]]:
     """A row an episode, in the order of ids; None where something is not known.
 
@@ -155,7 +158,7 @@ def rows_of(
         dataset: whose bags and decision logs.
         names: id -> short name of every episode.
         decided: id -> decision in force.
-        selected: ids of the selected episodes.
+        selected: id of each selected episode -> the spans that are kept of it, None: all of it.
     """
     scored = {
         i: in_force(d for d in dataset.decisions(i) if d.by == CURATOR).get(i) or decision
@@ -168,6 +171,9 @@ def rows_of(
         decision = decided.get(episode_id)
         row: dict[str, Any] = dict.fromkeys(COLUMNS)
         row |= {"episode": episode_id, "name": name, "selected": episode_id in selected}
+        if episode_id in selected:
+            spans = selected[episode_id]
+            row["selected_spans"] = " ".join(f"{s[0]}:{s[1]}" if s else "all" for s in spans)
         row["steps"], row["duration_s"] = _extent(dataset, episode_id)
         row |= dict.fromkeys(SCORE_PREFIX + s for s in scorers)
         if decision is not None:
@@ -212,7 +218,7 @@ def _arrow() -> Any:
     try:
         import pyarrow as pa
         import pyarrow.parquet
-    except ImportError as err:
+    except ModuleNotFoundError as err:
         raise ConfigError(
             "format 'parquet' needs pyarrow: pip install 'curation_ros[parquet]'"
         ) from err

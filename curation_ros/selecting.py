@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from datetime import datetime, timezone
 from pathlib import Path
 
-from curation_ros.bags.reader import read_episode
+from curation_ros.bags.reader import episode_of, open_bag, read_episode
+from curation_ros.core.balance import Balance, balance_of, phase_steps
 from curation_ros.core.decisions import CURATOR, Decision, in_force
 from curation_ros.core.episode import Episode
-from curation_ros.core.errors import ConfigError
+from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.scorers import SCORERS
-from curation_ros.core.selection import Candidate, Manifest, select
+from curation_ros.core.selection import Candidate, Entry, Manifest, Span, select
 from curation_ros.core.topic_map import TopicMap
 from curation_ros.dataset import Dataset
 
@@ -19,7 +21,7 @@ from curation_ros.dataset import Dataset
 def save_selection(
     dataset: Dataset,
     *,
-    rule: str,
+    rule: str = "",
     value: float | None = None,
     scorer: str = "",
     name: str = "",
@@ -29,7 +31,7 @@ def save_selection(
 
     Args:
         dataset: its bags are the candidates, its decision logs have scores and verdicts.
-        rule: one of KEEP_RULES.
+        rule: one of KEEP_RULES; empty: `gap` where a scorer is named, else `decisions`.
         value: what the rule takes.
         scorer: whose scores rank, for the rules that rank.
         name: of the manifest; empty makes one of rule and time.
@@ -37,8 +39,9 @@ def save_selection(
 
     Raises:
         ConfigError: if the rule and its value do not fit, or it ranks and no scorer is named.
-        CurationError: if there is no bag, or the name is taken.
+        CurationError: if there is no bag, the name is taken, or the scores do not separate.
     """
+    rule = rule or ("gap" if scorer else "decisions")
     ranks = rule not in ("decisions", "all")
     if scorer and not ranks:
         raise ConfigError(f"keep rule {rule!r} ranks nothing: --scorer {scorer} needs a --rule")
@@ -60,9 +63,11 @@ def save_selection(
         for bag in bags
     ]
     if ranks and all(c.score is None for c in candidates):
+        is_fitted = scorer in SCORERS and SCORERS[scorer].needs == "reference"
         raise ConfigError(
             f"dataset {dataset.path}: no episode has a logged score of {scorer!r}: run "
             f"curation score {dataset.path} --write --scorers {scorer}"
+            + (" --reference DATASET" if is_fitted else "")
         )
     resolution = SCORERS[scorer]().resolution if scorer in SCORERS else 0.0
     chosen = select(
@@ -81,8 +86,32 @@ def save_selection(
         rule_params={"value": value, "seed": seed},
         state_hash=",".join(sorted(hashes)),
         abstained=chosen.abstained,
+        phases=phases_of(dataset, chosen.entries),
     )
     return manifest, dataset.save_manifest(manifest)
+
+
+def phases_of(dataset: Dataset, entries: Iterable[Entry]) -> Balance:
+    """How much of each phase the entries of a selection show.
+
+    Of each bag only clock and phase are read: 5 ms, of which opening it is nearly half. Of one
+    that cannot be read, or has no phases, they are not known.
+    """
+    return balance_of((e.episode, _phase_steps(dataset, e.episode, e.span)) for e in entries)
+
+
+def _phase_steps(dataset: Dataset, episode_id: str, span: Span | None) -> dict[str, int] | None:
+    try:
+        bag = open_bag(dataset.bag_path(episode_id))
+        topic_map = bag.topic_map()
+        phases = topic_map.with_role("phase") if topic_map is not None else ()
+        if topic_map is None or not phases:
+            return None
+        return phase_steps(
+            episode_of(bag, topic_map.only([topic_map.clock, phases[0].name])), span
+        )
+    except CurationError:  # who reads it to train on it is told
+        return None
 
 
 def _scored(dataset: Dataset, episode_id: str) -> Decision | None:

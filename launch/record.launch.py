@@ -7,24 +7,23 @@ ros2 launch curation_ros record.launch.py sim:=false topic_map:=my_robot.yaml
 from launch import LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
-    EmitEvent,
     LogInfo,
     RegisterEventHandler,
+    Shutdown,
     TimerAction,
 )
 from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessExit
-from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 # The curator may wait this long for late samples (its drain_timeout_s) before it decides.
-_LAST_DECISION_S = 4.0
+_LAST_DECISION_S = 5.0
 
 ARGUMENTS = (
     ("dataset", "dataset", "folder of the dataset; made where it does not exist"),
-    ("reference", "", "dataset or bag of trusted demonstrations; empty: every verdict is review"),
+    ("reference", "", "dataset or bag of trusted demonstrations; empty: none"),
     ("config", "", "YAML file of scorers and rule; empty: config/curation.yaml"),
     ("topic_map", "", "YAML file of the topic map; empty: the LIBERO robot of sim_node"),
     ("sim", "true", "false: your robot publishes; start episodes by curation record"),
@@ -42,6 +41,11 @@ def generate_launch_description() -> LaunchDescription:
     def number(name, kind):
         return ParameterValue(LaunchConfiguration(name), value_type=kind)
 
+    def others_follow(event, context):
+        if context.is_shutdown:  # Ctrl-C has reached everybody
+            return []
+        return [Shutdown(reason=f"{event.process_name} has ended with code {event.returncode}")]
+
     with_sim = LaunchConfiguration("sim")
     common = {"dataset": text("dataset")}
     judged = {**common, "topic_map": text("topic_map")}
@@ -49,12 +53,14 @@ def generate_launch_description() -> LaunchDescription:
         package="curation_ros",
         executable="recorder",
         output="screen",
+        on_exit=others_follow,
         parameters=[{**judged, "auto": number("sim", bool)}],
     )
     curator = Node(
         package="curation_ros",
         executable="curator",
         output="screen",
+        on_exit=others_follow,
         parameters=[
             {
                 **judged,
@@ -79,22 +85,30 @@ def generate_launch_description() -> LaunchDescription:
             }
         ],
     )
-    recorded = [
-        LogInfo(msg="sim_node has ended; recorder and curator follow"),
-        TimerAction(
-            period=_LAST_DECISION_S,
-            actions=[EmitEvent(event=Shutdown(reason="all demonstrations are recorded"))],
-        ),
-    ]
+
+    def sim_has_ended(event, context):
+        if context.is_shutdown or event.returncode:
+            return others_follow(event, context)
+        return [
+            LogInfo(msg="sim_node has ended; recorder and curator follow"),
+            TimerAction(
+                period=_LAST_DECISION_S,
+                actions=[Shutdown(reason="all demonstrations are recorded")],
+            ),
+        ]
+
     return LaunchDescription(
         [
             *(
                 DeclareLaunchArgument(name, default_value=default, description=description)
                 for name, default, description in ARGUMENTS
             ),
+            # Before it starts: a sim node that refuses its parameters is soon gone.
+            RegisterEventHandler(OnProcessExit(target_action=sim, on_exit=sim_has_ended)),
+            # First: where an argument is not the number it should be, launch gives up at that
+            # node, and leaves those that it has started running.
+            sim,
             recorder,
             curator,
-            sim,
-            RegisterEventHandler(OnProcessExit(target_action=sim, on_exit=recorded)),
         ]
     )

@@ -144,7 +144,7 @@ class PolicyNode(Node):
 
 def main() -> int:
     """Entry point of `ros2 run curation_ros policy_node`."""
-    return run(PolicyNode)
+    return run(PolicyNode, PARAMETERS)
 
 
 if __name__ == "__main__":

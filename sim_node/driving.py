@@ -164,7 +164,7 @@ class Driver:
             commands: filled by the node's subscriptions.
             settings: the node's parameters.
             announced: yields until who is waited for has taken notice of a started episode.
-            deaf: name of who is waited for and has no command of a started episode yet, or empty.
+            deaf: name of who is waited for and lacks a topic of a started episode, or empty.
             stamp_ns: before the first stamp; default: the wall's time.
         """
         self._env = env
@@ -232,10 +232,21 @@ class Driver:
         """The command of this step, once it is there."""
         if self.reset_wanted:
             raise AbortedError("reset was asked for")
+
+        def observe() -> None:
+            self._out.observation(self._stamp_ns, observation, tracker, run.id)
+
         if run.controller is not None:
             xyz, gripper = run.controller.act(observation, phase)
-            self._out.command(self._stamp_ns, xyz, gripper)
+
+            def act() -> None:
+                self._out.command(self._stamp_ns, xyz, gripper)
+
             self._commands.accept(self._stamp_ns)
+            act()
+            yield from self._until_heard(run, lambda: [], observe, act)
+            if run.executed == 0:  # who is free does not make up for the time that took
+                run.began_s = time.monotonic()
             yield from self._paced(run)
             return list(xyz), gripper
         if self._p["sync"] == "free":
@@ -243,20 +254,7 @@ class Driver:
             if self._commands.is_fresh(self._p["hold_timeout_s"]):
                 return self._commands.newest
             return [0.0, 0.0, 0.0], 0.0
-        timeout_s = self._p["command_timeout_s"]
-        asked_s = repeated_s = time.monotonic()
-        while (missing := self._commands.missing(self._stamp_ns)) or self._unheard(run):
-            now_s = time.monotonic()
-            if self.reset_wanted:
-                raise AbortedError("reset was asked for")
-            if missing and now_s - asked_s > timeout_s:
-                raise AbortedError(f"no answer on {' and '.join(missing)} within {timeout_s:g} s")
-            if now_s - asked_s > timeout_s + _HEARING_S:
-                raise AbortedError(f"the first command does not reach {self._unheard(run)}")
-            if now_s - repeated_s > _REPEAT_S:
-                repeated_s = now_s
-                self._out.observation(self._stamp_ns, observation, tracker, run.id)
-            yield False
+        yield from self._until_heard(run, lambda: self._commands.missing(self._stamp_ns), observe)
         now_s = time.monotonic()
         if run.executed == 0 or now_s - self._checked_s > _CHECK_S:
             self._checked_s = now_s
@@ -264,12 +262,37 @@ class Driver:
                 raise AbortedError(f"commands come from {strangers}: stop all but one")
         return self._commands.newest
 
-    def _unheard(self, run: Run) -> str:
-        """Who has not got the first command yet.
+    def _until_heard(
+        self, run: Run, missing: Callable[[], list[str]], *again: Callable[[], None]
+    ) -> Iterator[bool]:
+        """Wait until the command is here, and the first one where it is waited for.
 
-        That we hear the commander and are heard by the recorder says nothing of those two. What
-        follows the first command follows it everywhere, for the transport is reliable; until
-        then the observation is repeated, and so is its answer.
+        Args:
+            run: the episode.
+            missing: topics without an answer to this step's observation.
+            again: what is said anew every half second.
+        """
+        asked_s = repeated_s = time.monotonic()
+        while (absent := missing()) or self._unheard(run):
+            now_s, timeout_s = time.monotonic(), self._p["command_timeout_s"]
+            if self.reset_wanted:
+                raise AbortedError("reset was asked for")
+            if absent and now_s - asked_s > timeout_s:
+                raise AbortedError(f"no answer on {' and '.join(absent)} within {timeout_s:g} s")
+            if now_s - asked_s > timeout_s + _HEARING_S:
+                raise AbortedError(f"the first step does not reach {self._unheard(run)}")
+            if now_s - repeated_s > _REPEAT_S:
+                repeated_s = now_s
+                for say in again:
+                    say()
+            yield False
+
+    def _unheard(self, run: Run) -> str:
+        """Who has not got all of the first step yet.
+
+        That we see a recorder's subscriptions, or hear a commander, does not say that the recorder
+        has found our publishers, or the commander's. What follows the first step follows it
+        everywhere, for the transport is reliable; until then the step is said again.
         """
         return "" if run.executed else self._deaf(run.id)
 

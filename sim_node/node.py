@@ -13,7 +13,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from curation_ros.core.status import ERROR, OK, Status
+from curation_ros.core.status import ERROR, OK, Status, counts_from_status
 from curation_ros.dataset import Dataset
 from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import status_from_ros, time_from_ros
@@ -81,6 +81,7 @@ class SimNode(Node):
         self._driver = Driver(self._env, self._out, self._commands, p, self._announced, self._deaf)
         self._is_recorded = p["episodes"] > 0 and "recorder" in p["wait_for"]
         self._recorder: dict[str, Status] = {}
+        self._outcomes: list[str] = []
         if not self._expert:
             for topic, kind in zip(COMMAND_TOPICS, (TwistStamped, JointState), strict=True):
                 self.create_subscription(kind, topic, self._taker(topic), MAPPED)
@@ -139,17 +140,24 @@ class SimNode(Node):
                 self._report(episode)
                 yield from self._until_recorder(episode.id, "closed", "failed")
             if self._p["episodes"]:
+                n = self._outcomes.count("succeeded")
+                self.get_logger().info(f"{n} of {len(self._outcomes)} episodes succeeded")
                 return
 
     def _announced(self, episode_id: str) -> Iterator[bool]:
         return self._until_recorder(episode_id, "recording", "closed", "failed")
 
     def _deaf(self, episode_id: str) -> str:
-        """The recorder, until it says with its counts that the commands of an episode arrive."""
+        """The recorder until it has each of our topics in an episode, and which it has not."""
         said = self._recorder.get(episode_id)
         if not self._is_recorded or said is None or not said.message.startswith("recording"):
             return ""
-        return "" if any(key.startswith("count/") for key in said.values) else "recorder"
+        counts = counts_from_status(said)  # of the topics that it knows
+        ours = (*COMMAND_TOPICS, *self._out.observation_topics)
+        missing = [topic for topic in ours if counts.get(topic) == 0]
+        if not counts or not missing:
+            return "" if counts else "recorder"
+        return f"recorder on {' and '.join(missing)}"
 
     def _until_recorder(self, episode_id: str, *states: str) -> Iterator[bool]:
         """Wait for the recorder to say that of an episode, if it is in the game."""
@@ -178,7 +186,8 @@ class SimNode(Node):
         if episode.reason:
             self.get_logger().error(f"{episode.name}: {episode.reason} ({steps})")
         else:
-            self.get_logger().info(f"{episode.name}: ended ({steps})")
+            self.get_logger().info(f"{episode.name}: {episode.outcome} ({steps})")
+        self._outcomes.append(episode.outcome)
         level = OK if episode.outcome == "succeeded" else ERROR
         self._out.outcome(Status(level, episode.name, episode.outcome, episode.id))
         if self._dataset is not None:
@@ -187,7 +196,7 @@ class SimNode(Node):
 
 def main() -> int:
     """Entry point of `ros2 run curation_ros sim_node`."""
-    return run(SimNode)
+    return run(SimNode, PARAMETERS)
 
 
 if __name__ == "__main__":

@@ -31,26 +31,40 @@ HEAVY = re.compile(r"^(ros-|rclpy|torch|mujoco|robosuite|libero|numba)", re.IGNO
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory) -> Path:
     """The prefix of a virtual environment where pip has installed a copy of this tree."""
+    uv = _uv()
+    tree = _copy(tmp_path_factory.mktemp("trees") / "tree")
+    prefix = tmp_path_factory.mktemp("installed") / "prefix"
+    _check(uv, "venv", "--quiet", "--python", sys.executable, str(prefix))
+    _install(uv, str(prefix / "bin" / "python"), "--no-deps", str(tree))
+    return prefix
+
+
+def _uv() -> str:
     uv = shutil.which("uv", path=os.pathsep.join([str(Path(sys.executable).parent), *_path()]))
     if uv is None:
         pytest.skip("uv is not installed")
-    tree = tmp_path_factory.mktemp("tree")
+    return uv
+
+
+def _copy(tree: Path) -> Path:
+    """A copy of what is installed of this tree."""
+    tree.mkdir()
     for name in ("setup.py", "pyproject.toml", "package.xml", "LICENSE"):
         shutil.copy(ROOT / name, tree)
     for name in (*PACKAGES, "config", "launch", "libexec", "resource"):
         shutil.copytree(
             ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info")
         )
-    prefix = tmp_path_factory.mktemp("installed") / "prefix"
-    _check(uv, "venv", "--quiet", "--python", sys.executable, str(prefix))
-    python = str(prefix / "bin" / "python")
+    return tree
+
+
+def _install(uv: str, python: str, *what: str) -> None:
     try:
-        _check(uv, "pip", "install", "--quiet", "--python", python, "--no-deps", str(tree))
+        _check(uv, "pip", "install", "--quiet", "--python", python, *what)
     except subprocess.CalledProcessError as err:
         if re.search(r"dns error|error sending request|Failed to fetch", err.stderr):
             pytest.skip("offline, and setuptools is not in the cache of uv")
         pytest.fail(err.stderr)
-    return prefix
 
 
 def _path() -> list[str]:
@@ -125,6 +139,26 @@ def test_executable_without_ros_says_what_to_install(installed, folder):
     assert done.stderr.startswith("error: recorder needs ")
     assert done.stderr.count("\n") == 1
     assert "[ros]" in done.stderr
+
+
+def test_symlink_install_runs_on_the_active_python(tmp_path):
+    """What `colcon build --symlink-install` does, with the setuptools of Ubuntu 24.04."""
+    uv = _uv()
+    python = str(tmp_path / "venv/bin/python")
+    _check(uv, "venv", "--quiet", "--python", sys.executable, str(tmp_path / "venv"))
+    _install(uv, python, "setuptools==68.1.2")
+    tree = _copy(tmp_path / "tree")
+    prefix = tmp_path / "prefix"
+    (site := prefix / "lib").mkdir(parents=True)
+    command = ["-W", "ignore", "setup.py", "--quiet", "develop", "--no-deps"]
+    command += ["--install-dir", str(site), "--script-dir", str(prefix / "bin")]
+    subprocess.run(
+        [python, *command], cwd=tree, check=True, env={**os.environ, "PYTHONPATH": str(site)}
+    )
+    for name in EXECUTABLES:
+        program = prefix / "bin" / name
+        assert program.read_text().startswith("#!/usr/bin/env python3\n"), name
+        assert os.access(program, os.X_OK)
 
 
 def _without_ros(prefix: Path) -> str:

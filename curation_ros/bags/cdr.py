@@ -204,7 +204,7 @@ class CdrDecoder:
         sizes = messages.sizes
         if not len(messages):
             return job.columns()
-        rows = np.arange(len(sizes))
+        rows: npt.NDArray[np.int64] = np.arange(len(sizes))
         key = (type_name, tuple(paths))
         if min(len(rows), self._n_layouts.get(key, 0)) > _MAX_LAYOUTS:
             rows = job.decode_together()

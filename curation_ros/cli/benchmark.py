@@ -31,6 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--data", type=Path, help="where its demonstrations are, or go; default OUT/data"
     )
     parser.add_argument(
+        "--stage",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="do this stage alone, and report on it alone; may be given several times",
+    )
+    parser.add_argument(
         "--dry-run", action="store_true", help="collect and score, then say what would be done"
     )
     parser.add_argument(
@@ -76,6 +83,7 @@ def run(args: argparse.Namespace) -> int:
             said=said,
             ticked=lambda what, n, of: bar.update(task, description=what, completed=n, total=of),
             work=not args.dry_run,
+            stages=args.stage,
         )
     if args.dry_run:
         wanted = {policy for cell in study.cells for policy in cell.policies.values()}

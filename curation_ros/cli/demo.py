@@ -9,10 +9,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections import Counter
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from rich.progress import (
@@ -27,28 +28,37 @@ from rich.table import Column, Table
 from rich.text import Text
 from scipy.stats import fisher_exact
 
+from curation_ros.bags.reader import read_episode
 from curation_ros.cli.output import VERDICT_STYLE, console, percent, print_json
 from curation_ros.core.errors import CurationError
-from curation_ros.core.status import Status
+from curation_ros.core.selection import Manifest
+from curation_ros.core.status import EpisodeEvent, Status
+from curation_ros.core.stream import NS_PER_S
 from curation_ros.dataset import Dataset
 from curation_ros.evaluating import evaluate_on_graph, summary
 from curation_ros.processes import Domain, Nodes
 from curation_ros.selecting import save_selection
 
-# The reference has starts of its own, and none of these is an official one.
-_REFERENCE_SEED, _DEMONSTRATION_SEED, _TRAINING_SEED = 101, 7, 0
+# None of the starts that this seed generates is an official one.
+_DEMONSTRATION_SEED, _TRAINING_SEED = 7, 0
 _MAX_STEPS_DEFECTIVE = 350
 # Chosen on generated starts; without it a dozen demonstrations give a poor policy either way.
 _START_JITTER_M = 0.004
 _START_UP_S = 120.0
-_CONDITIONS = ("everything", "kept")
-_SIGNIFICANT = 0.05
+#: Name of the selection -> what people read.
+_CONDITIONS = {
+    "everything": "everything",
+    "kept": "kept",
+    "kept-and-salvaged": "kept + salvaged",
+}
+#: What is compared with what; the level is shared among these comparisons (Bonferroni).
+_COMPARISONS = (("kept", "everything"), ("kept-and-salvaged", "kept"))
+_SIGNIFICANT = 0.05 / len(_COMPARISONS)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("--out", type=Path, default=Path("demo"), help="a run gets a folder in it")
-    parser.add_argument("--references", type=int, default=6, help="clean reference demonstrations")
     parser.add_argument("--demonstrations", type=int, default=24, help="half of them defective")
     parser.add_argument("--rollouts", type=int, default=10, help="official starts for each policy")
     parser.add_argument("--train-steps", type=int, default=4000, help="gradient steps a policy")
@@ -64,13 +74,13 @@ def run(args: argparse.Namespace) -> int:
     demo = _Demo(args, folder)
     demo.say(
         "A robot puts a bowl onto a plate. We record demonstrations, half of which drop the bowl; "
-        "a curator decides on each while the robot is still at the table; two policies then show "
-        "whether that was worth it."
+        "a curator warns as it falls, and decides while the robot is still at the table; policies "
+        "then show whether that was worth it."
     )
     try:
-        demo.record_reference()
-        demo.record_demonstrations()
+        demo.record()
         manifests = demo.select()
+        demo.draw()
         policies = demo.train(manifests)
         results = demo.drive(policies)
     except KeyboardInterrupt:
@@ -84,9 +94,9 @@ class _Demo:
     def __init__(self, args: argparse.Namespace, folder: Path) -> None:
         self.args = args
         self.folder = folder
-        self.reference = folder / "reference"
         self.dataset = folder / "demonstrations"
         self.logs = folder / "logs"
+        self.pictures: tuple[Path, ...] = ()
 
     def say(self, text: str) -> None:
         if not self.args.json:
@@ -94,89 +104,100 @@ class _Demo:
 
     # --- recording --------------------------------------------------------------------------
 
-    def record_reference(self) -> None:
-        n = self.args.references
-        self.say(
-            f"[bold]1. Reference.[/] The scorer needs a few demonstrations that somebody trusts: "
-            f"{n} clean ones, never trained on."
-        )
-        parameters = {"episodes": n, "seed": _REFERENCE_SEED, "task": "reference"}
-        with self._graph("reference", self.reference) as (nodes, watcher):
-            self._record(nodes, watcher, self.reference, parameters, "reference", [])
-
-    def record_demonstrations(self) -> None:
-        n = self.args.demonstrations
-        self.say(
-            f"[bold]2. Demonstrations.[/] {n}, shuffled; the curator knows only the stream. "
-            "Its rule: gripper timing, with a threshold fitted on the reference."
-        )
-        parameters = {
-            "episodes": n,
-            "seed": _DEMONSTRATION_SEED,
-            "contamination": 0.5,
-            "defect": "early_release",
-            "max_steps_defective": _MAX_STEPS_DEFECTIVE,
-            "task": "demo",
-        }
-        with self._graph("demonstrations", self.dataset) as (nodes, watcher):
-            nodes.start("curator", {"dataset": self.dataset, "reference": [self.reference]})
-            self._record(nodes, watcher, self.dataset, parameters, "demonstrations", ["curator"])
-
-    @contextmanager
-    def _graph(self, name: str, dataset: Path) -> Iterator[tuple[Nodes, Any]]:
+    def record(self) -> None:
         from curation_ros.nodes.watching import Watcher
 
+        n = self.args.demonstrations
+        self.say(
+            f"[bold]1. Demonstrations.[/] {n}, shuffled; the curator sees what is published, and "
+            "nothing else. What decides is the bowl: from LIFT to the end of TRANSPORT it has to "
+            "stay with the gripper. That needs no label and no trusted reference. "
+            "Of a demonstration that broke, the good beginning is salvaged."
+        )
         domain = Domain()
         try:
             with (
-                Nodes(domain, self.logs / name) as nodes,
+                Nodes(domain, self.logs / "demonstrations") as nodes,
                 Watcher(domain.environment) as watcher,
             ):
-                nodes.start("recorder", {"dataset": dataset})
-                yield nodes, watcher
+                nodes.start("recorder", {"dataset": self.dataset})
+                nodes.start("curator", {"dataset": self.dataset})
+                nodes.start(
+                    "sim_node",
+                    {
+                        "episodes": n,
+                        "seed": _DEMONSTRATION_SEED,
+                        "contamination": 0.5,
+                        "defect": "early_release",
+                        "max_steps_defective": _MAX_STEPS_DEFECTIVE,
+                        "task": "demo",
+                        "dataset": self.dataset,
+                        "wait_for": ["recorder", "curator", "watcher"],
+                    },
+                )
+                self._watch(nodes, watcher, n)
+                nodes.wait("sim_node", _START_UP_S)
         finally:
             domain.close()
 
-    def _record(
-        self,
-        nodes: Nodes,
-        watcher: Any,
-        dataset: Path,
-        parameters: dict[str, Any],
-        what: str,
-        also: list[str],
-    ) -> None:
-        n = parameters["episodes"]
-        wait_for = ["recorder", *also, "watcher"]
-        nodes.start("sim_node", {**parameters, "dataset": dataset, "wait_for": wait_for})
-        ended = 0
+    def _watch(self, nodes: Nodes, watcher: Any, n: int) -> None:
+        """Show alerts and decisions as they fall, until all episodes are decided."""
+        ended: dict[str, EpisodeEvent] = {}
+        alerts: dict[str, tuple[float, Status]] = {}
         decided: set[str] = set()
         with self._progress() as bar:
-            task = bar.add_task(f"{what}: starting the nodes", total=n)
-            while ended < n or (also and len(decided) < n):
+            task = bar.add_task("starting the nodes", total=n)
+            while len(decided) < n:
                 nodes.check()
                 watcher.look(0.1)
+                now_s = time.monotonic()
                 while watcher.events:
                     event = watcher.events.popleft()
-                    ended += event.event != "started"
-                    bar.update(task, completed=ended, description=f"recording {event.name}")
+                    if event.event != "started":
+                        ended[event.id] = event
+                    text = f"recording {event.name}"
+                    bar.update(task, completed=len(ended), description=text)
+                while watcher.alerts:
+                    alert = watcher.alerts.popleft()
+                    alerts[alert.hardware_id] = now_s, alert
+                    self._show_alert(bar, alert)
                 while watcher.decisions:
                     decision = watcher.decisions.popleft()
+                    before: dict[str, float] = {}
+                    if decision.hardware_id not in decided and decision.hardware_id in alerts:
+                        heard_s, alert = alerts[decision.hardware_id]
+                        before = _lead(alert, now_s - heard_s, ended.get(decision.hardware_id))
                     decided.add(decision.hardware_id)
-                    self._show(bar, decision)
-            bar.update(task, description="recorded")
-            nodes.wait("sim_node", _START_UP_S)
+                    self._show_decision(bar, decision, before)
+            bar.update(task, completed=n, description="recorded")
 
-    def _show(self, bar: Progress, decision: Status) -> None:
+    def _show_alert(self, bar: Progress, alert: Status) -> None:
+        """One row of the live table, while the robot still moves."""
+        if self.args.json:
+            row = {"alert": alert.message, "episode": alert.hardware_id, "name": alert.name}
+            print_json({**row, **alert.values})
+            return
+        reason = alert.values.get("reason", alert.message)
+        self._row(bar, alert.name, Text("ALERT", "bold red"), reason)
+
+    def _show_decision(self, bar: Progress, decision: Status, before: dict[str, float]) -> None:
         """One row of the live table, as the decision falls."""
         if self.args.json:
-            print_json({"episode": decision.hardware_id, "name": decision.name, **decision.values})
+            row = {"episode": decision.hardware_id, "name": decision.name}
+            print_json({**row, **decision.values, **before})
             return
+        reason = decision.values.get("reason", "")
+        if before:
+            reason += f" (alert {before['alert_before_s']:.1f} s ago"
+            if "alert_before_end_s" in before:
+                reason += f", {before['alert_before_end_s']:.1f} s before the end by robot time"
+            reason += ")"
+        verdict = Text(decision.message, VERDICT_STYLE.get(decision.message, ""))
+        self._row(bar, decision.name, verdict, reason)
+
+    def _row(self, bar: Progress, name: str, what: Text, words: str) -> None:
         row = Table.grid(Column(width=10), Column(width=8), Column(ratio=1), padding=(0, 2, 0, 0))
-        style = VERDICT_STYLE.get(decision.message, "")
-        row.add_row(
-            decision.name, Text(decision.message, style), Text(decision.values.get("reason", ""))
-        )
+        row.add_row(name, what, Text(words))
         bar.console.print(row)
 
     def _progress(self) -> Progress:
@@ -194,32 +215,65 @@ class _Demo:
     # --- selecting and training -------------------------------------------------------------
 
     def select(self) -> dict[str, Path]:
+        """Manifests of the conditions; without the last where nothing was salvaged."""
         dataset = Dataset(self.dataset)
-        manifests = {}
-        sizes = {}
-        for name, rule in zip(_CONDITIONS, ("all", "decisions"), strict=True):
-            manifest, manifests[name] = save_selection(dataset, rule=rule, name=name)
-            sizes[name] = (len(manifest.entries), manifest.kept_of)
-        kept, total = sizes["kept"]
-        self.say(
-            f"[bold]3. Selection.[/] {kept} of {total} demonstrations are kept. Scorer: "
-            f"gripper_timing; it needs a trusted reference ({self.args.references} "
-            "demonstrations), no labels."
+        everything, path = save_selection(dataset, rule="all", name="everything")
+        manifests = {"everything": path}
+        both = save_selection(dataset, rule="decisions", name="kept-and-salvaged")
+        kept = _whole_only(both[0], "kept")
+        salvaged_s = [
+            (e.span[1] - e.span[0]) / NS_PER_S for e in both[0].entries if e.span is not None
+        ]
+        manifests["kept"] = dataset.save_manifest(kept)
+        if salvaged_s:
+            manifests["kept-and-salvaged"] = both[1]
+        by = Counter(
+            str(d.evidence.get("decided_by", "nothing"))
+            for d in dataset.latest_decisions().values()
         )
-        if not kept:
+        whose = ", ".join(f"{scorer} ({count})" for scorer, count in by.most_common())
+        beginnings = (
+            f"of {len(salvaged_s)} more the beginning is salvaged, {median(salvaged_s):.1f} s in "
+            "the median"
+            if salvaged_s
+            else "nothing is salvaged"
+        )
+        self.say(
+            f"[bold]2. Selection.[/] {len(kept.entries)} of {everything.kept_of} demonstrations "
+            f"are kept whole; {beginnings}. Decided by {whose}."
+        )
+        if not kept.entries:
             raise CurationError("the curator kept nothing, so there is nothing to train on")
         return manifests
+
+    def draw(self) -> None:
+        """The picture of the first salvaged episode."""
+        dataset = Dataset(self.dataset)
+        decisions = sorted(dataset.latest_decisions().values(), key=lambda d: d.name)
+        salvaged = next((d for d in decisions if d.verdict == "salvage"), None)
+        if salvaged is None:
+            return
+        try:
+            from curation_ros.reporting.salvaged import save_salvage_figure
+        except ImportError:
+            self.say("No picture of a salvaged episode: matplotlib is not installed.")
+            return
+        episode = read_episode(dataset.bag_path(salvaged.episode))
+        self.pictures = save_salvage_figure(episode, salvaged, self.folder)
 
     def train(self, manifests: dict[str, Path]) -> dict[str, Path]:
         steps = self.args.train_steps
         self.say(
-            f"[bold]4. Training.[/] The same behaviour cloning on each: {steps} gradient steps; "
+            f"[bold]3. Training.[/] The same behaviour cloning on each: {steps} gradient steps; "
             f"bowl and plate blurred by {1e3 * _START_JITTER_M:g} mm, so that a dozen is enough."
         )
         jobs: dict[str, subprocess.Popen[str]] = {}
         logs = {name: self.logs / f"train-{name}.log" for name in manifests}
         with self._progress() as bar:
-            tasks = {name: bar.add_task(f"training on {name}", total=steps) for name in manifests}
+            tasks = {
+                name: bar.add_task(f"training on {_CONDITIONS[name]}", total=steps)
+                for name in manifests
+            }
             try:
                 for name, manifest in manifests.items():
                     command = [sys.executable, "-m", "curation_ros.cli.main", "train", "--json"]
@@ -253,7 +307,7 @@ class _Demo:
     def drive(self, policies: dict[str, Path]) -> dict[str, dict[str, Any]]:
         n = self.args.rollouts
         self.say(
-            f"[bold]5. Test.[/] Each policy drives the robot over the graph, from the same {n} "
+            f"[bold]4. Test.[/] Each policy drives the robot over the graph, from the same {n} "
             "start states, none of which was demonstrated."
         )
         rows: dict[str, list[dict[str, Any]]] = {name: [] for name in policies}
@@ -273,14 +327,16 @@ class _Demo:
         stop = threading.Event()
         threads = [threading.Thread(target=work, args=pair) for pair in policies.items()]
         with self._progress() as bar:
-            tasks = {name: bar.add_task(f"trained on {name}", total=n) for name in policies}
+            tasks = {
+                name: bar.add_task(f"trained on {_CONDITIONS[name]}", total=n) for name in policies
+            }
             try:
                 for thread in threads:
                     thread.start()
                 while any(thread.is_alive() for thread in threads) and not failures:
                     for name, task in tasks.items():
                         wins = sum(row["success"] for row in rows[name])
-                        text = f"trained on {name}: {wins} succeeded"
+                        text = f"trained on {_CONDITIONS[name]}: {wins} succeeded"
                         bar.update(task, completed=len(rows[name]), description=text)
                     time.sleep(0.1)
             finally:
@@ -297,39 +353,70 @@ class _Demo:
         if self.args.json:
             for name, result in results.items():
                 print_json({"condition": name, **result})
+            for picture in self.pictures:
+                print_json({"picture": str(picture)})
             return
         self.say("[bold]What came out[/]")
         table = Table(box=None, pad_edge=False, show_header=False)
-        for name, result in results.items():
-            interval = (result["ci95"][0], result["ci95"][1])
-            shown = percent(result["successes"], result["rollouts"], interval)
-            table.add_row(f"trained on {name}", shown)
+        for name, words in _CONDITIONS.items():
+            shown = "nothing was salvaged, so there is no such policy"
+            if name in results:
+                r = results[name]
+                shown = percent(r["successes"], r["rollouts"], (r["ci95"][0], r["ci95"][1]))
+            table.add_row(f"trained on {words}", shown)
         console.print(table)
-        everything, kept = (results[name] for name in _CONDITIONS)
-        console.print(_verdict(everything, kept))
+        for first, second in _COMPARISONS:
+            if first in results:
+                console.print(_compared(first, second, results))
+        seen = f"picture    {self.pictures[0]} (and .svg)\n" if self.pictures else ""
         console.print(
-            f"\nbags       {self.dataset}/episodes\nindex      {self.dataset}/index.sqlite\n"
+            f"\n{seen}"
+            f"bags       {self.dataset}/episodes\nindex      {self.dataset}/index.sqlite\n"
             f"decisions  {self.dataset}/decisions\nnode logs  {self.logs}\n"
             f"took       {seconds / 60:.1f} minutes\n\n"
             "Next:\n"
             f"  .venv/bin/curation index {self.dataset}\n"
-            f"  .venv/bin/curation score {self.dataset} --reference {self.reference}\n"
+            f"  .venv/bin/curation score {self.dataset}\n"
             f"  .venv/bin/curation override {self.dataset} demo-0001 keep --reason 'looks fine'",
             markup=False,
             soft_wrap=True,
         )
 
 
-def _verdict(everything: dict[str, Any], kept: dict[str, Any]) -> str:
+def _lead(alert: Status, heard_s: float, end: EpisodeEvent | None) -> dict[str, float]:
+    """How long before a decision its alert came, and before the end on the episode's own clock.
+
+    The simulator may be faster or slower than a robot, so the two differ.
+    """
+    lead = {"alert_before_s": heard_s}
+    if end is not None and end.end_ns is not None:
+        sure_ns = end.start_ns + int(alert.values["span_end"])
+        lead["alert_before_end_s"] = (end.end_ns - sure_ns) / NS_PER_S
+    return lead
+
+
+def _whole_only(manifest: Manifest, name: str) -> Manifest:
+    """The same selection without its spans."""
+    return replace(
+        manifest,
+        name=name,
+        entries=tuple(e for e in manifest.entries if e.span is None),
+        rule_params={**manifest.rule_params, "salvaged": False},
+    )
+
+
+def _compared(first: str, second: str, results: dict[str, dict[str, Any]]) -> str:
     """What two counts say, in words that claim no more than they can."""
-    counts = [[r["successes"], r["rollouts"] - r["successes"]] for r in (kept, everything)]
+    one, other = results[first], results[second]
+    counts = [[r["successes"], r["rollouts"] - r["successes"]] for r in (one, other)]
     p = float(fisher_exact(counts).pvalue)
-    chance = f"p = {p:.2g}, Fisher's exact test; one training seed each"
-    if p < _SIGNIFICANT:
-        better = kept["rate"] > everything["rate"]
-        which = "better" if better else "WORSE: curation did harm here"
-        return f"The policy trained on the kept demonstrations is {which} ({chance})."
-    return f"No difference is shown: so few rollouts can fall out like this by chance ({chance})."
+    which = f"{_CONDITIONS[first]} against {_CONDITIONS[second]}"
+    chance = f"p = {p:.2g}, Fisher's exact test, one training seed each"
+    if p >= _SIGNIFICANT:
+        return f"{which}: no difference is shown, so few rollouts can differ by chance ({chance})."
+    better = one["rate"] > other["rate"]
+    word = "better" if better else "WORSE, it did harm here"
+    return f"{which}: {word} ({chance})."
 
 
 def _last_step(log: Path) -> int:

@@ -73,8 +73,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
-    except ImportError as err:
+    except ModuleNotFoundError as err:
         return _complain(f"{chosen} needs {err.name}: install its extra", USAGE)
+    except ImportError as err:  # it is there, and does not load
+        return _complain(f"{chosen}: {str(err).partition(chr(10))[0]}", USAGE)
     except Exception as err:
         if os.environ.get("CURATION_TRACEBACK"):
             raise

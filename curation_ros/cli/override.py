@@ -7,6 +7,7 @@ import getpass
 from pathlib import Path
 
 from curation_ros.cli.output import print_json, say
+from curation_ros.core.errors import ConfigError
 from curation_ros.curating import OVERRIDES, override
 from curation_ros.dataset import Dataset
 
@@ -16,15 +17,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", type=Path)
     parser.add_argument("episode", help="short name, id, or the beginning of an id")
     parser.add_argument("verdict", choices=OVERRIDES)
+    parser.add_argument(
+        "--until",
+        type=float,
+        metavar="SECONDS",
+        help="with salvage: the part that is kept ends there, from the start of the episode",
+    )
     parser.add_argument("--reason", default="", help="in your words")
     parser.add_argument("--by", default="", help="who decides; default: the user's name")
 
 
 def run(args: argparse.Namespace) -> int:
     """Log the decision."""
-    by = args.by or _user()
+    if (args.verdict == "salvage") != (args.until is not None):
+        raise ConfigError("--until belongs to salvage, and salvage needs --until SECONDS")
     decision = override(
-        Dataset(args.dataset), args.episode, args.verdict, args.reason, by, state_hash=""
+        Dataset(args.dataset),
+        args.episode,
+        args.verdict,
+        args.reason,
+        args.by or _user(),
+        state_hash="",
+        until_s=args.until,
     )
     if args.json:
         print_json(decision.to_json())

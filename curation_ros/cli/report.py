@@ -10,7 +10,9 @@ from curation_ros.cli.output import print_json, say
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("results", type=Path, help="results.json of `curation benchmark`")
+    parser.add_argument(
+        "results", type=Path, help="results.json of `curation benchmark`, or its folder"
+    )
     parser.add_argument(
         "--out", type=Path, help="folder of the report; default: where the results are"
     )
@@ -20,8 +22,9 @@ def run(args: argparse.Namespace) -> int:
     """Write the report and say where it is."""
     from curation_ros.reporting import read_results, write_report
 
-    found = read_results(args.results)
-    written = write_report(found, args.out or args.results.parent)
+    path = args.results / "results.json" if args.results.is_dir() else args.results
+    found = read_results(path)
+    written = write_report(found, args.out or path.parent)
     missing = sum(stage["missing"] for stage in found["stages"])
     if args.json:
         print_json(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -17,13 +18,14 @@ from curation_ros.bags.reader import find_bags
 from curation_ros.cli.arguments import add_config, add_reference, add_workers
 from curation_ros.cli.output import VERDICT_STYLE, console, print_json, progress_console, warn
 from curation_ros.configuration import read_curation, read_reference, share_file
-from curation_ros.core.decisions import VERDICTS, Decision
+from curation_ros.core.decisions import CURATOR, VERDICTS, Decision, in_force
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.examination import Examination
-from curation_ros.core.rules import RULES
+from curation_ros.core.rules import RULES, NoRule
 from curation_ros.core.scorers import SCORERS
 from curation_ros.core.scoring import Curation
 from curation_ros.core.selection import TieKey
+from curation_ros.core.stream import NS_PER_S
 from curation_ros.core.topic_map import read_topic_map
 from curation_ros.curating import log_decision
 from curation_ros.dataset import Dataset
@@ -32,6 +34,7 @@ from curation_ros.examining import EpisodesOf, Examined, Examiner, judge_bags
 _DONE, _FINDINGS, _NOTHING = 0, 1, 3
 _FIXED_WIDTH, _SCORE_WIDTH = 64, 12
 _FEW = 5
+_LATE_S = 0.1
 _Judged: TypeAlias = "tuple[Examined, Decision | None]"
 
 
@@ -72,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
     rows: list[dict[str, Any]] = []
     n_bad, n_twice = 0, 0
     n_known: Counter[bool] = Counter()
+    changes: Counter[tuple[str, str]] = Counter()
     verdicts: Counter[str] = Counter()
     flawed = False
     bags, missing = _find(args.paths)
@@ -105,7 +109,10 @@ def run(args: argparse.Namespace) -> int:
             _report(args, one.path, one.result)
             continue
         if dataset is not None:
+            before = in_force(dataset.decisions(decision.episode)).get(decision.episode)
             decision = _logged(dataset, one.path, decision)
+            if before is not None and before.verdict != decision.verdict:
+                changes[before.verdict, decision.verdict] += 1
         verdicts[decision.verdict] += 1
         n_twice += decision.episode in curation.reference_ids_
         flawed = flawed or bool(decision.findings)
@@ -113,7 +120,8 @@ def run(args: argparse.Namespace) -> int:
         if args.json:
             print_json(row)
         else:
-            rows.append(row)
+            kept = _kept(decision, one.result)
+            rows.append({**row, "kept": kept, "decided_by": _decided_by(decision)})
     if rows:
         for line in curation.describe().splitlines():
             # What a scorer is set to stands in the configuration; that it is silent, nowhere else.
@@ -132,6 +140,9 @@ def run(args: argparse.Namespace) -> int:
         found = ", ".join(f"{verdicts[v]} {v}" for v in VERDICTS if verdicts[v])
         text = f"scored {n_read}, of which {n_known[True]} were known; {n_bad} could not be read"
         progress_console.print(f"{found}; {text}" if found else text, style="dim")
+    if changes:
+        listed = ", ".join(f"{n} from {old} to {new}" for (old, new), n in changes.most_common())
+        warn(f"decisions that were there are replaced: {listed}")
     if not n_read:
         return _NOTHING
     return _FINDINGS if args.check and (flawed or n_bad) else _DONE
@@ -170,8 +181,9 @@ def _curation(args: argparse.Namespace) -> Curation:
     if args.value is not None:
         if args.rule is None:
             raise ConfigError(f"--value {args.value:g} belongs to a --rule: name one")
-        key = "threshold" if args.rule == "threshold" else "value"
-        settings["rule_params"] = {key: args.value}
+        rule = RULES.get(args.rule, NoRule)  # an unknown one is refused where all else is
+        takes_threshold = "threshold" in inspect.signature(rule).parameters
+        settings["rule_params"] = {"threshold" if takes_threshold else "value": args.value}
     return read_curation(config, settings)
 
 
@@ -221,25 +233,49 @@ def decision_row(path: Path, seen: Examination, decision: Decision) -> dict[str,
     }
 
 
+def _kept(decision: Decision, seen: Examination) -> str:
+    """For people: which part is kept of what is salvaged; empty for other verdicts."""
+    if decision.verdict != "salvage":
+        return ""
+    first_s, last_s = (ns / NS_PER_S for ns in decision.span)
+    # The first step is a little after the start: that is the beginning.
+    begins = f"from {first_s:.2f} s\n" if first_s >= _LATE_S else ""
+    whole_s = max(seen.span[1], decision.span[1]) / NS_PER_S
+    return f"\n{begins}until {last_s:.2f} s\nof {whole_s:.2f} s"
+
+
+def _decided_by(decision: Decision) -> str:
+    """For people: the scorer whose score decided, and its score; or the person."""
+    scorer = decision.evidence.get("decided_by", "")
+    if decision.by != CURATOR or not scorer:
+        return "-" if decision.by == CURATOR else decision.by
+    return f"{scorer.replace('_', ' ')}\n{_number(decision.scores.get(scorer))}"
+
+
 def _table(rows: list[dict[str, Any]], curation: Curation) -> Table:
-    """All scores where the terminal is wide enough, else the one that decides."""
+    """All scores where the terminal is wide enough, else the one that decided."""
     scorers = list(curation.scorers)
-    if console.width < _FIXED_WIDTH + _SCORE_WIDTH * len(scorers):
-        scorers = [curation.rule_scorer]
+    is_wide = console.width >= _FIXED_WIDTH + _SCORE_WIDTH * len(scorers)
+    if not is_wide:
+        scorers = []
         progress_console.print("a wider terminal, or --json, shows all scores", style="dim")
     table = Table(box=None, pad_edge=False)
     table.add_column("episode", no_wrap=True)
     table.add_column("decision", no_wrap=True)
     for heading in ("steps", *(s.replace("_", " ") for s in scorers)):
         table.add_column(heading, justify="right")
+    if not is_wide:
+        table.add_column("decided by", no_wrap=True)
     table.add_column("reason", ratio=1)
     for row in rows:
-        scores = [row["scores"][s] for s in scorers]
-        table.add_row(
-            Text(row["name"] or row["episode"][:8]),
-            Text(row["decision"], VERDICT_STYLE[row["decision"]]),
-            str(row["length"]),
-            *("-" if v is None else f"{v:.3g}" for v in scores),
-            Text(row["reason"]),
-        )
+        cells = [Text(row["name"] or row["episode"][:8])]
+        cells += [Text(row["decision"] + row["kept"], VERDICT_STYLE[row["decision"]])]
+        cells += [Text(str(row["length"])), *(Text(_number(row["scores"][s])) for s in scorers)]
+        if not is_wide:
+            cells += [Text(row["decided_by"])]
+        table.add_row(*cells, Text(row["reason"]))
     return table
+
+
+def _number(score: float | None) -> str:
+    return "-" if score is None else f"{score:.3g}"

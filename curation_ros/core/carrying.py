@@ -56,6 +56,10 @@ _FOLLOW_S, _FOLLOW_M, _FOLLOW_NOISES = 0.5, 0.002, 1.0
 _ALLOWED_M, _ALLOWED_NOISES = 0.015, 0.5
 _THRESHOLD_M, _THRESHOLD_NOISES = 0.012, 4.0
 _STEP_SHARE = 0.6
+#: After a command to open an object is expected to leave: unless it may have been put down, this
+#: share of the threshold is enough then; more than one step's, for it may have been let go for a
+#: moment only.
+_OPENED_SHARE = 0.65
 #: An object that slid by more than this through the fingers is no longer held as it was grasped.
 _SLIP_M = 0.04
 #: It was carried at all if it went this far along the effector's way; the effector must have gone
@@ -192,6 +196,7 @@ class CarryWatch:
 
     Attributes:
         n_steps: steps seen.
+        blind_from: first step at which it was known that the poses cannot tell; None so far.
     """
 
     def __init__(self, topic_map: TopicMap) -> None:
@@ -202,6 +207,7 @@ class CarryWatch:
         self._grip: _Grip | None = None
         self._reason = ""
         self.n_steps = 0
+        self.blind_from: int | None = None
 
     def take(self, episode: Episode) -> Self:
         """Look at the steps that are new; those before must be as they were.
@@ -211,6 +217,8 @@ class CarryWatch:
         """
         first, self.n_steps = self.n_steps, len(episode)
         self._reason = self._reason or self._cannot(episode)
+        if self._reason:
+            self.blind_from = 0
         if self._reason or first >= self.n_steps:
             return self
         held, blind = carry_steps(episode)
@@ -221,17 +229,18 @@ class CarryWatch:
                     if self._grip is None:
                         self._grip = _Grip(_grasp(rows, step), step)
                     self._grip.take(rows, step)
+                    self._note(step, self._grip.so_far())
                 elif not blind[step]:
-                    self._end()
+                    self._note(step, self._end())
         return self
 
     @property
-    def lost(self) -> Hold | None:
-        """The first hold of which it is known by now that its object is not carried any more."""
+    def losses(self) -> list[Hold]:
+        """The holds of which it is known by now that their objects are not carried any more."""
         holds = [*self._done, *([] if self._grip is None else [self._grip.so_far()])]
         # Without phases nobody says that every closing was to carry something.
         states = ("broken", "never") if self._labels else ("broken",)
-        return next((h for h in holds if h.state in states), None)
+        return [h for h in holds if h.state in states]
 
     def finish(self) -> Carrying:
         """What is known after the last step; what is still held then is unknown."""
@@ -263,11 +272,16 @@ class CarryWatch:
             return str(err).partition(": ")[2]
         return ""
 
-    def _end(self) -> None:
+    def _note(self, step: int, hold: Hold | None) -> None:
+        if self.blind_from is None and hold is not None and hold.state == "unknown":
+            self.blind_from = step
+
+    def _end(self) -> Hold | None:
         hold = self._grip.ended() if self._grip is not None else None
         self._grip = None
         if hold is not None:
             self._done.append(hold)
+        return hold
 
 
 def _to_look_at(held: Mask, blind: Mask, first: int) -> list[int]:
@@ -422,6 +436,11 @@ class _Leaving:
         """Whether an object at that distance may be held as it was."""
         return distance_m - self._held_m <= self._allowed_m
 
+    @property
+    def is_likely(self) -> bool:
+        """Whether it has left, if something else speaks for that, too."""
+        return self._sum_m > _OPENED_SHARE * self._threshold_m
+
     def add(self, distance_m: float, after_s: float) -> bool:
         """Take a sample, so long after the last one; whether it is sure now."""
         self.away_m = away_m = distance_m - self._held_m
@@ -528,23 +547,31 @@ class _Grip:
             self._good = [*self._good[-2:], seen]
         elif self._departed is None:
             self._departed, self._left_open = step, self._opened_z is not None
-        if is_sure:
+        if is_sure or (self._leaving.is_likely and self._is_let_go(seen)):
             self._lose(step, seen)
 
     def _lose(self, step: int, seen: Point) -> None:
         """It is away: dropped, put down, or never taken along."""
         self._is_over = True
-        if self._left_open and self._opened_z is not None and self._phase == CARRY_PHASES[-1]:
-            fell_m = self._opened_z - seen[2]
-            if fell_m < _PUT_DOWN_M + 2.0 * self._grasp.noise_m:
-                self._departed, self._is_put_down = None, True
-                return
+        if self._left_open and self._may_be_put_down(seen):
+            self._departed, self._is_put_down = None, True
+            return
         self._noticed = step
         self._departed = step if self._departed is None else self._departed
         self._state = "broken" if self._went_along_m() >= CARRIED_M else "never"
         if self._state == "never" and self._grasp.unseen:
             name, unseen = self._grasp.object, self._grasp.unseen
             self._give_up(f"{name} was not carried, and {unseen} has no pose")
+
+    def _is_let_go(self, seen: Point) -> bool:
+        """Whether the gripper was told to open, where nothing is put down."""
+        return self._opened_z is not None and not self._may_be_put_down(seen)
+
+    def _may_be_put_down(self, seen: Point) -> bool:
+        """Whether it is in the last of the phases, and not lower than when it was to be let go."""
+        if self._opened_z is None or self._phase != CARRY_PHASES[-1]:
+            return False
+        return self._opened_z - seen[2] < _PUT_DOWN_M + 2.0 * self._grasp.noise_m
 
     def _went_along_m(self) -> float:
         """How far the object went along the effector's way, before it began to leave."""

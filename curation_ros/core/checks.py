@@ -6,6 +6,7 @@ where there is a reference by what trusted episodes look like. Nothing here read
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from curation_ros.core.alerts import AlertWatch
+from curation_ros.core.alerts import LOST, AlertWatch
 from curation_ros.core.errors import EpisodeError
 from curation_ros.core.findings import Finding
 from curation_ros.core.gripper import first_opening, is_closed_command, is_open_command
@@ -48,9 +49,11 @@ FROZEN_COMMANDED_SHARE = 0.25
 #: Rows that equal the last one in every value. Coarse encoders of a robot at rest repeat rows,
 #: too: then the tail must be this many times as long as any such rest before it.
 PADDED_STEPS, PADDED_FACTOR = 10, 3
-#: A start in mid-motion: faster in the first step than any trusted one by this factor, and at a
-#: good part of the episode's own speed.
+#: A start in mid-motion: faster in the first step than any trusted one by this factor, at a good
+#: part of the episode's own speed, and no longer getting faster: who starts from rest at full
+#: speed is, in the first step, at half of what it has after four.
 CLIPPED_SPEED_FACTOR, CLIPPED_SPEED_SHARE = 1.3, 0.5
+CLIPPED_RISE_SHARE, _RISE_STEPS = 0.7, 4
 #: The speed of a step that nothing physical explains, in units of the fast steps (95 %) of the
 #: episode; those of clean simulated demonstrations reach 2.
 JUMP_FACTOR = 8.0
@@ -82,7 +85,7 @@ class Baseline:
             episode has none.
         starts_open_, closes_, opens_: 1 if all of them start with an open gripper, close it, and
             open it again; else 0.
-        carries_: 1 if none of them loses what it has grasped; else 0.
+        usual_: ids of what most of them show that would be an alert: here it is none.
     """
 
     def fit(self, episodes: Iterable[Episode]) -> Self:
@@ -115,7 +118,8 @@ class Baseline:
         self.starts_open_ = int(bool(facts) and all(not f.starts_closed for f in facts))
         self.closes_ = int(bool(facts) and all(f.closes for f in facts))
         self.opens_ = int(bool(facts) and all(f.opening is not None for f in facts))
-        self.carries_ = int(bool(facts) and all(f.lost is None for f in facts))
+        shown = Counter(id_ for f in facts for id_ in {finding.id for finding in f.alarming})
+        self.usual_ = tuple(sorted(k for k, n in shown.items() if 2 * n > len(facts)))
         return self
 
     def fitted(self) -> dict[str, Any]:
@@ -143,7 +147,7 @@ class _Facts:
     closed: Mask
     opening: int | None
     held_s: float
-    lost: Finding | None
+    alarming: list[Finding]
 
     @classmethod
     def of(cls, episode: Episode) -> _Facts:
@@ -177,7 +181,7 @@ class _Facts:
             held_s=(
                 0.0 if opening is None else float(times_s[opening] - times_s[int(closed.argmax())])
             ),
-            lost=AlertWatch(episode.topic_map).take(episode),
+            alarming=AlertWatch(episode.topic_map).all(episode),
         )
 
     @property
@@ -230,7 +234,7 @@ def check_episode(episode: Episode, baseline: Baseline | None = None) -> tuple[F
     known = [f for f in found if f is not None]
     if any(f.kind == "recording" or f.id == "jump" for f in (*episode.findings, *known)):
         # Where a pose cannot be trusted, neither can what it shows of another.
-        known = [f for f in known if f.id not in ("object-lost", "not-carried")]
+        known = [f for f in known if f.id not in LOST]
     return tuple(known)
 
 
@@ -252,6 +256,7 @@ def _clipped_start(
         spread is not None
         and facts.start_speed > CLIPPED_SPEED_FACTOR * spread.start_speed_
         and facts.start_speed > CLIPPED_SPEED_SHARE * facts.fast
+        and facts.start_speed > CLIPPED_RISE_SHARE * float(facts.speed[:_RISE_STEPS].max())
     ):
         text = (
             f"the effector moves at {facts.start_speed:.3g} {_unit(episode)}/s in the first step, "
@@ -406,8 +411,9 @@ def _task(
     if facts.has_gripper and not facts.closes and (baseline is None or baseline.closes_):
         text = "the gripper was never commanded to close"
         found.append(Finding("never-grasped", text, episode.span(0, last)))
-    if baseline is None or baseline.carries_:
-        found.append(facts.lost)
+    usual = () if baseline is None else baseline.usual_
+    lost = (f for f in facts.alarming if f.id in LOST and f.id not in usual)
+    found.append(next(lost, None))
     if facts.opening is not None:
         text = ""
         limit = len(labels) - 1 if baseline is None else baseline.open_phase_

@@ -31,6 +31,33 @@ class Part:
 
 
 @dataclass(frozen=True)
+class Break:
+    """Where an episode that was right until then went wrong, as a scorer sees it.
+
+    Attributes:
+        at_ns: nanoseconds from the start stamp of the episode.
+        margin_s: what the good beginning keeps away from it.
+        span: of that beginning, nanoseconds from the start stamp, inclusive; None where nothing
+            worth keeping is left.
+    """
+
+    at_ns: int
+    margin_s: float
+    span: Span | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data that `from_json` reads back."""
+        span = None if self.span is None else list(self.span)
+        return {"at_ns": self.at_ns, "margin_s": self.margin_s, "span": span}
+
+    @classmethod
+    def from_json(cls, raw: Any) -> Break:
+        """Read what `to_json` wrote."""
+        span = None if raw["span"] is None else _span(raw["span"])
+        return cls(int(raw["at_ns"]), float(raw["margin_s"]), span)
+
+
+@dataclass(frozen=True)
 class Examination:
     """Everything that a rule judges by: a function of the episode and of the fitted scorers.
 
@@ -45,6 +72,7 @@ class Examination:
         evidence: plain JSON values that go with the decision.
         content: digest of the values, the same for copies under other names.
         part: what could be saved of a recording that is bad at an end.
+        breaks: scorer -> where it sees the episode break, for those that see that.
     """
 
     episode: str
@@ -58,6 +86,7 @@ class Examination:
     evidence: Mapping[str, Any] = field(default_factory=dict)
     content: str = ""
     part: Part | None = None
+    breaks: Mapping[str, Break] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Plain data that `from_json` reads back to an equal examination."""
@@ -82,6 +111,7 @@ class Examination:
                 "abstained": dict(part.abstained),
                 "words": dict(part.words),
             },
+            "breaks": {name: one.to_json() for name, one in self.breaks.items()},
         }
 
     @classmethod
@@ -113,8 +143,9 @@ class Examination:
                     abstained=part["abstained"],
                     words=part["words"],
                 ),
+                breaks={name: Break.from_json(one) for name, one in raw["breaks"].items()},
             )
-        except (KeyError, TypeError, ValueError, IndexError) as err:
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
             raise EpisodeError(f"examination: {type(err).__name__} {err} in {raw!r:.200}") from err
 
 

@@ -61,6 +61,7 @@ FINDINGS: dict[str, tuple[Kind, str]] = {
     "too-short": ("recording", "too few steps to be a demonstration"),
     "idle": ("motion", "the robot rests for long and then goes on"),
     "jump": ("motion", "the effector moves from one step to the next as no other step does"),
+    "grip-lost": ("task", "the fingers held nothing while something was to be carried"),
     "never-grasped": ("task", "the gripper was never commanded to close"),
     "not-carried": ("task", "what the gripper closed on did not come along"),
     "object-lost": ("task", "what was grasped left the effector before it was to be let go"),

@@ -54,6 +54,7 @@ def grip_of(episode: Episode, *, effort: str = "") -> Carrying:
         return Carrying(reason=str(err).partition(": ")[2])
     labels = carry_labels(episode.topic_map)
     phase = episode.phase
+    seen = np.flatnonzero(held | ~blind)
     holds = []
     for first, last in _holds(held, blind):
         since_ns = episode.stamps_ns[first] - int(GRASP_S * NS_PER_S)
@@ -64,7 +65,7 @@ def grip_of(episode: Episode, *, effort: str = "") -> Carrying:
         where = "" if phase is None else labels.get(int(np.nan_to_num(phase[at], nan=-1.0)), "")
         opened = hold.departed is not None and bool(is_open[first : hold.departed + 1].any())
         hold = replace(hold, phase=where, opened=opened)
-        if hold.state == "carried" and last == len(held) - 1:
+        if hold.state == "carried" and last == seen[-1]:
             where = f"in {where}" if where else "with the gripper closed"
             hold = replace(hold, state="unknown", reason=f"it ends {where}", n_carried=0)
         holds.append(hold)
@@ -115,7 +116,7 @@ def _by_gap(width: Floats, hold: Hold, before: int) -> Hold:
     opening = np.fmax.accumulate(width[: hold.last + 1])[part]
     # The wider of two in a row: one wild value does not set what is narrow.
     narrowest = np.fmin.accumulate(np.fmax(gap, np.concatenate([gap[:1], gap[:-1]])))
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         lost = (gap < EMPTY_SHARE * opening) | (gap - narrowest > APART_SHARE * opening)
     decided = _decided(hold, lost[skipped:])
     if decided.noticed is None:

@@ -59,7 +59,8 @@ def gripper_command(episode: Episode) -> Floats:
 def _held(sign: npt.NDArray[np.int8]) -> npt.NDArray[np.int8]:
     """Replace every 0 by the last value before it that is not 0; leading zeros stay."""
     index = np.maximum.accumulate(np.where(sign != 0, np.arange(len(sign)), 0))
-    return sign[index]
+    held: npt.NDArray[np.int8] = sign[index]
+    return held
 
 
 def commanded(episode: Episode) -> npt.NDArray[np.int8]:
@@ -131,9 +132,10 @@ def finger_width(episode: Episode) -> Floats | None:
         return None
     values = episode.field(spec.fingers)
     # Column by column: over so short an axis, max and min are several times slower.
-    spread: Floats = reduce(np.maximum, values.T) - reduce(np.minimum, values.T)
-    if values.shape[1] == 1 or not np.any(spread):
-        spread = values.sum(axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):  # whatever a broken sensor says
+        spread: Floats = reduce(np.maximum, values.T) - reduce(np.minimum, values.T)
+        if values.shape[1] == 1 or not np.any(spread):
+            spread = values.sum(axis=1)
     return spread
 
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from curation_ros.core.decisions import CURATOR, Decision, Verdict, untrustworthy
-from curation_ros.core.examination import Examination
+from curation_ros.core.examination import Examination, Span
 from curation_ros.core.rules import Rule
+from curation_ros.core.stream import NS_PER_S
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,8 @@ def decide(
     A recording that cannot be trusted is for review whatever its scores, with its finding as the
     reason; unless it is bad at an end only, and the rule keeps the rest: that is salvaged.
     Then the rule judges; what it would keep although the task was seen to fail is for a person.
-    Odd motion is noted and decides nothing.
+    Of what it would salvage the beginning is kept, up to a margin before it broke; where that is
+    not known, or nothing is left, it is discarded. Odd motion is noted and decides nothing.
 
     Args:
         seen: the episode, examined.
@@ -59,6 +61,7 @@ def decide(
     """
     faults = untrustworthy(seen.findings)
     span = seen.span
+    facts: dict[str, Any] = {}
     verdict: Verdict
     if faults:
         more = f" (and {len(faults) - 1} more findings)" if len(faults) > 1 else ""
@@ -72,6 +75,18 @@ def decide(
         verdict, reason = "review", no_rule
     else:
         verdict, reason = rule.judge(seen.scores, seen.abstained, seen.words, seen.episode)
+        decided_by = rule.decider(seen.scores)
+        facts["decided_by"] = decided_by
+        if verdict == "salvage":
+            verdict, span, more = _salvaged(seen, decided_by)
+            reason += more
+            if verdict == "salvage":
+                broke = seen.breaks[decided_by]
+                facts["salvage"] = {
+                    "scorer": decided_by,
+                    "broke_ns": broke.at_ns,
+                    "margin_s": broke.margin_s,
+                }
         failed = [f for f in seen.findings if f.kind == "task"]
         if verdict == "keep" and failed:
             verdict, reason = "review", f"{failed[0].id}: {failed[0].message}; but {reason}"
@@ -84,8 +99,18 @@ def decide(
         scores=dict(seen.scores),
         abstained=dict(seen.abstained),
         findings=seen.findings,
-        evidence={**seen.evidence, **(evidence or {})},
+        evidence={**seen.evidence, **(evidence or {}), **facts},
         revision=revision,
         by=by,
         state_hash=state_hash,
     )
+
+
+def _salvaged(seen: Examination, scorer: str) -> tuple[Verdict, Span, str]:
+    """Verdict, span and the end of the reason for an episode that a scorer saw break."""
+    broke = seen.breaks.get(scorer)
+    if broke is None:
+        return "discard", seen.span, ""
+    if broke.span is None:
+        return "discard", seen.span, "; too little was good before that"
+    return "salvage", broke.span, f"; kept until {broke.span[1] / NS_PER_S:.2f} s"

@@ -27,11 +27,13 @@ class Rule(ABC):
             scores of the dataset that is decided on (`fit_dataset`).
         min_references: how many trusted episodes at least.
         min_episodes: how many episodes of the dataset at least.
+        consults: scorers that it asks before the one that it is given.
     """
 
     needs: Literal["nothing", "reference", "dataset"] = "nothing"
     min_references: ClassVar[int] = 0
     min_episodes: ClassVar[int] = 0
+    consults: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, *, scorer: str) -> None:
         """Store the name of the scorer that decides."""
@@ -45,6 +47,22 @@ class Rule(ABC):
             resolution: `Scorer.resolution`: the difference that counts as none.
         """
         return self
+
+    def fit_consulted(self, reference_scores: Mapping[str, Sequence[float]]) -> Self:
+        """Learn from what the consulted scorers say of the reference, where there is one.
+
+        Args:
+            reference_scores: scorer -> scores of the trusted episodes that it can tell.
+        """
+        return self
+
+    def without_reference(self, why: str) -> Self | None:
+        """The rule where it needs a reference and there is none that it can learn from.
+
+        Returns:
+            None where it cannot judge then.
+        """
+        return None
 
     def fit_dataset(
         self,
@@ -82,8 +100,13 @@ class Rule(ABC):
             episode: its id: a rule that keeps a number of episodes draws lots at the cut.
 
         Returns:
-            The verdict and its reason.
+            The verdict and its reason; `salvage` if the episode broke, and its good beginning is
+            worth keeping where there is one.
         """
+
+    def decider(self, scores: Mapping[str, float | None]) -> str:
+        """The scorer whose score of an episode decides."""
+        return self.scorer
 
     def params(self) -> dict[str, Any]:
         """Hyper-parameters by name."""
@@ -238,6 +261,121 @@ class Threshold(Rule):
             f"keep where {self.scorer} >= {self.threshold_:.6g} (fitted on {self.n_} references, "
             f"lowest {self.low_:.6g}, median {self.median_:.6g})"
         )
+
+
+#: Scorers of a law of the task, the strongest first -> what it means that nothing broke.
+LAWFUL: dict[str, str] = {
+    "object_coupling": "what was grasped stayed with the effector until it was let go",
+    "grip_consistency": "the fingers held something for as long as something was to be carried",
+    "phase_events": "the gripper stayed closed for as long as something was to be carried",
+}
+#: The same, in the same order, by the kind of their evidence.
+_LAWS: tuple[tuple[str, ...], ...] = (
+    ("object_coupling",),
+    ("grip_consistency", "phase_events"),
+)
+#: Below this a law was broken: 1 but for the resolution of these scorers.
+_INTACT = 0.98
+
+
+class Evidence(Threshold):
+    """The first evidence that can tell decides; what broke is cut, not thrown away.
+
+    1. Object pose: `object_coupling`. What was grasped stayed with the effector until it was let
+       go, or it did not.
+    2. Gripper and phase: `grip_consistency` (what the fingers held) and `phase_events` (what was
+       commanded). One that says that it broke outweighs one that does not.
+    3. A trusted reference: a threshold on the scorer that the rule is given, see `Threshold`.
+    4. Else a person.
+
+    The first two are laws of the task and need no threshold: an intact episode is kept, of a
+    broken one the beginning is salvaged. Where the pose says that an object left, and the fingers
+    held on with no command to open, the pose may be wrong: then a person is asked. What they
+    could not know is said in the reason. Without a reference, the third is left out.
+
+    Attributes:
+        no_reference_: why there is no threshold; empty where there is one.
+        void_: scorers whose law is none here: most of the trusted episodes break it.
+    """
+
+    consults = tuple(LAWFUL)
+
+    def __init__(
+        self, *, scorer: str, threshold: float | None = None, false_alarm: float = 0.01
+    ) -> None:
+        """Store the parameters; see `Threshold`, they are of the third step."""
+        super().__init__(scorer=scorer, threshold=threshold, false_alarm=false_alarm)
+        self.no_reference_ = ""
+        self.void_: tuple[str, ...] = ()
+
+    def fit_consulted(self, reference_scores: Mapping[str, Sequence[float]]) -> Self:
+        """Leave out the laws that most of the trusted episodes break."""
+        self.void_ = tuple(
+            name
+            for name, scores in reference_scores.items()
+            if 2 * sum(score < _INTACT for score in scores) > len(scores)
+        )
+        return self
+
+    def without_reference(self, why: str) -> Self:
+        """Judge by the first two kinds of evidence alone."""
+        self.no_reference_ = why
+        return self
+
+    def decider(self, scores: Mapping[str, float | None]) -> str:
+        """The first scorer that can tell, of one kind of evidence the one that saw it break."""
+        for names in _LAWS:
+            told = {n: scores.get(n) for n in names if n not in self.void_}
+            known = {n: s for n, s in told.items() if s is not None}
+            if known:
+                broken = [n for n, score in known.items() if score < _INTACT]
+                return (broken or list(known))[0]
+        return self.scorer
+
+    def judge(
+        self,
+        scores: Mapping[str, float | None],
+        abstained: Mapping[str, str],
+        words: Mapping[str, str],
+        episode: str = "",
+    ) -> tuple[Verdict, str]:
+        """Ask one after the other."""
+        name = self.decider(scores)
+        silent = {n: f"cannot tell: {abstained[n]}" for n in self.consults if n in abstained}
+        silent |= dict.fromkeys(self.void_, "is no law here: most of the reference breaks it")
+        stronger = self.consults[: self.consults.index(name)] if name in LAWFUL else self.consults
+        blind = "".join(f"; {n} {silent[n]}" for n in stronger if n in silent)
+        score = scores.get(name)
+        if score is not None and name in LAWFUL:
+            if score >= _INTACT:
+                return "keep", f"{name}: {LAWFUL[name]}{blind}"
+            if name == _LAWS[0][0] and self._is_doubted(scores):
+                doubt = f"grip_consistency: {LAWFUL['grip_consistency']}"
+                return "review", f"{words.get(name, name)}; but {doubt}"
+            return "salvage", f"{words.get(name, f'{name} {score:.2f}')}{blind}"
+        if self.cut is None:
+            why = self.no_reference_ or "no reference"
+            return "review", f"{blind[2:]}; {why}" if blind else why
+        verdict, text = super().judge(scores, abstained, words, episode)
+        return verdict, f"{text}{blind}"
+
+    def _is_doubted(self, scores: Mapping[str, float | None]) -> bool:
+        """Whether the fingers held on to what is said to have left, and nobody told them not to.
+
+        Then the pose may be wrong: it jumped, came late, or is another object's.
+        """
+        held, told = (
+            scores.get(name) if name not in self.void_ else None
+            for name in ("grip_consistency", "phase_events")
+        )
+        opened = told is not None and told < _INTACT
+        return held is not None and held >= _INTACT and not opened
+
+    def describe(self) -> str:
+        """What is asked, in which order."""
+        laws = ", then ".join(" and ".join(names) for names in _LAWS)
+        last = f"review: {self.no_reference_}" if self.no_reference_ else super().describe()
+        return f"the first that can tell: {laws}; then {last}"
 
 
 class _Ranked(Rule):
@@ -462,6 +600,7 @@ def _told_apart(a: float, b: float) -> tuple[str, str]:
 
 #: Name -> class. The only list of rules.
 RULES: dict[str, type[Rule]] = {
+    "evidence": Evidence,
     "threshold": Threshold,
     "top-fraction": TopFraction,
     "top-k": TopK,

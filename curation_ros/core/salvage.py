@@ -1,4 +1,4 @@
-"""What can be saved of an episode: for now, of a recording that is bad at its beginning or end."""
+"""What can be saved of an episode: of a recording that is bad at an end, of a task that failed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from curation_ros.core.findings import Finding
+from curation_ros.core.stream import NS_PER_S
 
 if TYPE_CHECKING:
     from curation_ros.core.episode import Episode
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
 CONFINED = ("padded-tail", "not-finite")
 #: A part shorter than this share of the episode is no demonstration any more.
 _LEAST_SHARE = 0.5
+#: What a good beginning keeps away from the break, unless something else is asked for.
+DEFAULT_MARGIN_S = 0.75
+#: A beginning shorter than this shows nothing of a task.
+LEAST_PREFIX_S = 1.0
 
 
 def sound_part(episode: Episode, faults: Iterable[Finding]) -> tuple[int, int] | None:
@@ -47,3 +52,21 @@ def sound_part(episode: Episode, faults: Iterable[Finding]) -> tuple[int, int] |
     if not whole or len(steps) < max(2.0, _LEAST_SHARE * len(episode)):
         return None
     return first, last
+
+
+def good_prefix(episode: Episode, broke_at: int, margin_s: float) -> tuple[int, int] | None:
+    """First and last step of the beginning of an episode, up to a margin before it broke.
+
+    Args:
+        episode: the episode, whole.
+        broke_at: step at which something went wrong.
+        margin_s: at least so long before that step the beginning ends, in seconds of its stamps.
+
+    Returns:
+        None where less than LEAST_PREFIX_S is left.
+    """
+    until_ns = int(episode.stamps_ns[broke_at]) - max(1, round(margin_s * NS_PER_S))
+    last = int(np.searchsorted(episode.stamps_ns, until_ns, side="right")) - 1
+    if last < 1 or episode.stamps_ns[last] - episode.stamps_ns[0] < LEAST_PREFIX_S * NS_PER_S:
+        return None
+    return 0, last

@@ -6,18 +6,19 @@ import hashlib
 import inspect
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Literal
 
 from curation_ros.core.checks import Baseline, check_episode
 from curation_ros.core.decisions import CURATOR, Decision, untrustworthy
 from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
-from curation_ros.core.examination import Examination, Part
+from curation_ros.core.examination import Break, Examination, Part
 from curation_ros.core.findings import Finding
 from curation_ros.core.gripper import gripper_findings
 from curation_ros.core.judgement import Ruling, decide
 from curation_ros.core.length_control import LengthControl
 from curation_ros.core.rules import RULES, Rule
-from curation_ros.core.salvage import sound_part
+from curation_ros.core.salvage import DEFAULT_MARGIN_S, good_prefix, sound_part
 from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, PoolScorer, Scorer
 from curation_ros.core.scorers.features import phase_name
 from curation_ros.core.selection import TieKey
@@ -31,11 +32,11 @@ if TYPE_CHECKING:
 NO_REFERENCE = "no reference"
 NO_DATASET = "it compares with the whole dataset, which was not given"
 #: Checks that read the gripper's command: void where its meaning is in doubt.
-_BY_GRIPPER = ("clipped-start", "never-grasped", "opened-early", "unfinished")
+_BY_GRIPPER = ("clipped-start", "grip-lost", "never-grasped", "opened-early", "unfinished")
 #: Refused references that are named; a mistake in a topic map is one of all of them.
 _SHOWN = 3
 #: Raised when the meaning of the state hash, or what an examination finds, changes.
-_STATE_VERSION = 3
+_STATE_VERSION = 5
 #: References are scored by scorers that were fitted without them; above this many, in groups.
 _MAX_FOLDS = 20
 
@@ -62,12 +63,13 @@ class Curation:
         self,
         *,
         scorers: Sequence[str] = DEFAULT_SCORERS,
-        rule: str = "threshold",
+        rule: str = "evidence",
         rule_scorer: str = "gripper_timing",
         length: str = "shortest-reference",
         length_value: float | None = None,
         scorer_params: Mapping[str, Mapping[str, Any]] | None = None,
         rule_params: Mapping[str, Any] | None = None,
+        salvage_margin_s: float | None = DEFAULT_MARGIN_S,
     ) -> None:
         """Check and store the configuration.
 
@@ -79,6 +81,8 @@ class Curation:
             length_value: its value, for the modes that take one.
             scorer_params: scorer -> its hyper-parameters, where they are not the defaults.
             rule_params: hyper-parameters of the rule.
+            salvage_margin_s: a beginning that is salvaged ends at least so long before the
+                episode broke, seconds from 0; None: nothing is salvaged.
 
         Raises:
             ConfigError: naming what does not exist, and what does.
@@ -90,6 +94,11 @@ class Curation:
         self.length_value = length_value
         self.scorer_params = {k: dict(v) for k, v in (scorer_params or {}).items()}
         self.rule_params = dict(rule_params or {})
+        self.salvage_margin_s = salvage_margin_s
+        if salvage_margin_s is not None and not 0.0 <= salvage_margin_s < math.inf:
+            raise ConfigError(
+                f"salvage_margin_s is {salvage_margin_s}, expected seconds from 0, or nothing"
+            )
         if not self.scorers or len(set(self.scorers)) < len(self.scorers):
             raise ConfigError(f"scorers {list(self.scorers)}: expected names, each once")
         for name in (*self.scorers, *self.scorer_params):
@@ -151,7 +160,8 @@ class Curation:
 
         Raises:
             EpisodeError: naming each reference episode that cannot be trusted, or that the
-                deciding scorer cannot score, and why.
+                deciding scorer cannot score, and why; where it can score none of them, and the
+                rule has other evidence, that goes on without it.
         """
         episodes = sorted(reference, key=lambda e: e.id)
         vars(self).pop("scoring_hash_", None)  # a fit that fails leaves nothing to score with
@@ -240,24 +250,50 @@ class Curation:
         """The rule as far as the reference fits it, else why there is none; what it has seen."""
         rule = self._make_rule()
         scorer = self.scorers_[self.rule_scorer]
+        rule.fit_consulted(
+            {
+                name: self._scores_told(self.scorers_[name], episodes)
+                for name in rule.consults
+                if name in self.scorers_ and name not in self.unfitted_
+            }
+        )
         if rule.needs == "nothing":
             return rule.fit([]), "", {"what": "nothing"}
         if rule.needs == "dataset":
             return None, "no other episode is scored yet", {"what": "dataset", "episodes": 0}
+        why = ""
         if not episodes:
-            return None, NO_REFERENCE, {"what": "reference", "episodes": 0}
-        if len(episodes) < rule.min_references:
+            why = NO_REFERENCE
+        elif len(episodes) < rule.min_references:
             why = (
                 f"the rule needs {rule.min_references} reference episodes, "
                 f"there are {len(episodes)}"
             )
-            return None, why, {"what": "reference", "episodes": len(episodes)}
-        if self.rule_scorer in self.unfitted_:
+        elif self.rule_scorer in self.unfitted_:
             why = f"{self.rule_scorer}: {self.unfitted_[self.rule_scorer]}"
-            return None, why, {"what": "reference", "episodes": len(episodes)}
-        scores = self._reference_scores(self.rule_scorer, episodes)
+        seen = {"what": "reference", "episodes": len(episodes)}
+        if why:
+            return rule.without_reference(why), why, seen
+        try:
+            scores = self._reference_scores(self.rule_scorer, episodes)
+        except EpisodeError as err:
+            # One of them may be at fault; all of them are not: this robot has nothing to score.
+            if self._scores_told(scorer, episodes):
+                raise
+            alone = rule.without_reference(str(err))
+            if alone is None:
+                raise
+            return alone, str(err), seen
         rule.fit(list(scores.values()), resolution=scorer.resolution)
         return rule, "", _seen("reference", scores)
+
+    def _scores_told(self, scorer: Scorer, episodes: Sequence[Episode]) -> list[float]:
+        """Scores of the episodes that a scorer does not abstain on."""
+        found = []
+        for episode in self._views(scorer, episodes):
+            with suppress(EpisodeError):
+                found.append(scorer.score(episode))
+        return found
 
     def ruling(
         self, scores: Mapping[str, float | None], *, final: bool, tie: TieKey | None = None
@@ -417,6 +453,7 @@ class Curation:
             evidence=evidence,
             content=episode.content_digest,
             part=part,
+            breaks=self._breaks(episode, abstained),
         )
 
     def _findings(self, episode: Episode) -> tuple[Finding, ...]:
@@ -449,6 +486,20 @@ class Curation:
                 }
         return scores, abstained, words, seen
 
+    def _breaks(self, episode: Episode, abstained: Mapping[str, str]) -> dict[str, Break]:
+        """Where scorers see the whole episode break."""
+        found: dict[str, Break] = {}
+        margin_s = self.salvage_margin_s
+        for name, scorer in self.scorers_.items():
+            if margin_s is None or name in abstained or scorer.length_controlled:
+                continue
+            step = scorer.broke_at(episode)
+            if step is not None:
+                kept = good_prefix(episode, step, margin_s)
+                at_ns = int(episode.stamps_ns[step]) - episode.start_ns
+                found[name] = Break(at_ns, margin_s, kept and episode.span(*kept))
+        return found
+
     def judge(
         self,
         seen: Examination,
@@ -472,8 +523,9 @@ class Curation:
             "scoring": self.scoring_hash_,
             "content": seen.content,
         }
-        if ruling.rule is not None and ruling.rule.cut is not None:
-            evidence["threshold"] = float(ruling.rule.cut)
+        rule = ruling.rule
+        if rule is not None and rule.cut is not None and rule.decider(seen.scores) == rule.scorer:
+            evidence["threshold"] = float(rule.cut)
         return decide(
             seen,
             ruling.rule,
@@ -515,6 +567,7 @@ class Curation:
     def _hash_scoring(self) -> str:
         state = {
             "version": _STATE_VERSION,
+            "salvage_margin_s": self.salvage_margin_s,
             "scorers": {
                 name: {
                     "version": scorer.version,

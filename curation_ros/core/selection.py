@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from curation_ros.core.balance import Balance
 from curation_ros.core.decisions import CURATOR, Decision
-from curation_ros.core.errors import ConfigError
+from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.separation import split_scores
 from curation_ros.core.stream import Floats
 
@@ -131,8 +132,8 @@ def select(
 
     Raises:
         ConfigError: if the rule does not exist, its value makes no sense, an episode is there
-            twice or has a score that is not finite, top-k asks for more than are scored, or gap
-            finds no two groups.
+            twice or has a score that is not finite, or top-k asks for more than are scored.
+        CurationError: if gap finds no two groups.
     """
     pool = list(candidates)
     _check_candidates(pool)
@@ -164,7 +165,11 @@ def select(
     if rule == "gap":
         split = split_scores(list(scores.values()), resolution=resolution)
         if split.cut is None:
-            raise ConfigError(f"keep rule 'gap': no two groups to choose from: {split.why}")
+            raise CurationError(
+                f"keep rule 'gap': no two groups to choose from: {split.why}; nothing is "
+                "selected: have a person review the episodes, or choose by another rule and its "
+                "value (top-fraction, top-k, threshold)"
+            )
         low, high = split.doubt
         silent += tuple(i for i in order if low < scores[i] < high)
         order = [i for i in order if scores[i] > split.cut and i not in silent]
@@ -251,6 +256,7 @@ class Manifest:
         entries: what is kept; an episode may appear with several spans.
         kept_of: number of episodes chosen from.
         abstained: ids of those that could not be judged.
+        phases: how much of each phase the entries show; None where nobody has counted.
     """
 
     name: str
@@ -263,6 +269,7 @@ class Manifest:
     rule_params: Mapping[str, Any] = field(default_factory=dict)
     state_hash: str = ""
     abstained: tuple[str, ...] = ()
+    phases: Balance | None = None
 
     def __post_init__(self) -> None:
         where = f"selection {self.name!r}"
@@ -306,6 +313,7 @@ class Manifest:
                 for e in self.entries
             ],
             "abstained": list(self.abstained),
+            **({"phases": self.phases.to_json()} if self.phases is not None else {}),
         }
 
     @classmethod
@@ -317,6 +325,11 @@ class Manifest:
         """
         if not isinstance(raw, Mapping):
             raise ConfigError(f"selection: expected a mapping, found {raw!r:.80}")
+        if "entries" not in raw:
+            raise ConfigError(
+                "no selection: expected what `curation select` writes into DATASET/selections, "
+                f"found a file with {', '.join(map(str, raw)) or 'nothing in it':.80}"
+            )
         try:
             return cls(
                 name=str(raw["name"]),
@@ -332,6 +345,7 @@ class Manifest:
                     for e in raw["entries"]
                 ),
                 abstained=tuple(str(i) for i in raw["abstained"]),
+                phases=Balance.from_json(raw["phases"]) if "phases" in raw else None,
             )
         except (KeyError, TypeError, ValueError) as err:
             raise ConfigError(f"selection: {type(err).__name__} {err} in {raw!r:.200}") from err

@@ -35,12 +35,12 @@ from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import single_from_ros, status_to_ros
 from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import DECISIONS, DRAIN_S, EVENTS, LATCHED
-from curation_ros.nodes.spinning import run
+from curation_ros.nodes.spinning import run, take_waiting
 from curation_ros.nodes.subscriptions import MappedSubscriptions
 from curation_ros.selecting import save_selection
 
 PARAMETERS = (
-    Parameter("dataset", "dataset", "folder of the dataset whose episodes are decided"),
+    Parameter("dataset", "dataset", "dataset whose episodes are decided", needed=True),
     Parameter("topic_map", "", "YAML file of the topic map; empty: the LIBERO robot of sim_node"),
     Parameter("reference", (), "datasets or bags of trusted demonstrations; empty: none"),
     Parameter("config", "", "YAML file of scorers and rule; empty: config/curation.yaml"),
@@ -49,6 +49,8 @@ PARAMETERS = (
     Parameter("drain_timeout_s", DRAIN_S, "patience for late samples after an end, s", 0.0, 60.0),
 )
 _KEPT = 200
+# A recorder that stops takes what was sent to it first, closes its bag, and says so.
+_LAST_WORD_S = 2.0
 
 
 class Curator(Node):
@@ -134,6 +136,8 @@ class Curator(Node):
         response.success, response.message = True, str(path)
         kept = len(manifest.entries)
         self.get_logger().info(f"kept {kept} of {manifest.kept_of}: {path}")
+        for line in manifest.phases.warnings() if manifest.phases is not None else ():
+            self.get_logger().warning(line)
         return response
 
     # --- messages out -----------------------------------------------------------------------
@@ -161,7 +165,12 @@ class Curator(Node):
         return False
 
     def close(self) -> None:
-        """Nothing is open: every decision is on disk before it is published."""
+        """Wait a moment for the end of the episode that runs: its owner may be stopping, too."""
+        deadline_s = time.monotonic() + _LAST_WORD_S
+        while self._live.running and time.monotonic() < deadline_s:
+            if not take_waiting(self):
+                time.sleep(_LAST_WORD_S / 100)
+            self.work()
 
     def _tell(self, decided: list[Decided]) -> None:
         for alert in self._live.take_alerts():
@@ -200,7 +209,7 @@ def _to_ros(d: Decision) -> DiagnosticStatus:
 
 def main() -> int:
     """Entry point of `ros2 run curation_ros curator`."""
-    return run(Curator)
+    return run(Curator, PARAMETERS)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -28,6 +30,7 @@ class Parameter:
         description: meaning and unit, in one line.
         low, high: range of a number, inclusive.
         choices: allowed texts.
+        needed: whether an empty text is refused.
     """
 
     name: str
@@ -36,6 +39,7 @@ class Parameter:
     low: float | None = None
     high: float | None = None
     choices: Sequence[str] = ()
+    needed: bool = False
 
 
 def declare(node: Node, table: Sequence[Parameter]) -> dict[str, Any]:
@@ -68,9 +72,41 @@ def declare(node: Node, table: Sequence[Parameter]) -> dict[str, Any]:
         ) as err:
             allowed = f" in [{p.low}, {p.high}]" if p.low is not None else ""
             kind = type(p.default).__name__ if p.default != () else "list of strings"
+            if isinstance(err, InvalidParameterTypeException):
+                if p.default == ():
+                    kind += f' ({p.name}:="[one, two]")'
+                elif isinstance(p.default, float):
+                    kind += " (1.0, not 1)"
             raise ConfigError(f"{where}: expected {kind}{allowed}: {err}") from err
         value = p.default if value is None else value
         if p.choices and value not in p.choices:
             raise ConfigError(f"{where}: {value!r} is none of {', '.join(p.choices)}")
-        values[p.name] = list(value) if p.default == () else value
+        if p.needed and not value:
+            raise ConfigError(f"{where} is empty: it is the {p.description}")
+        # What `[$(var reference)]` makes of nothing in a launch file is a list of one empty text.
+        values[p.name] = [text for text in value if text] if p.default == () else value
     return values
+
+
+def warn_of_unknown(node: Node, table: Sequence[Parameter]) -> None:
+    """Log the parameters that were given and do not exist.
+
+    A file may give parameters to many nodes at once (`/**`), so that they are no error.
+    """
+    for name in sorted(set(node._parameter_overrides) - set(node._parameters)):
+        near = get_close_matches(name, [p.name for p in table], 1)
+        instead = f"; is {near[0]!r} meant?" if near else ""
+        node.get_logger().warning(f"there is no parameter {name!r}: it changes nothing{instead}")
+
+
+def described(table: Sequence[Parameter]) -> str:
+    """The parameters of a node, a line each, for who asks on the command line."""
+    defaults = ["[]" if p.default == () else json.dumps(p.default) for p in table]
+    names, width = max(len(p.name) for p in table), max(map(len, defaults))
+    lines = [
+        f"  {p.name:{names}}  {default:{width}}  {p.description}"
+        + (f" ({', '.join(p.choices)})" if p.choices else "")
+        + (f" [{p.low:g} to {p.high:g}]" if p.low is not None else "")
+        for p, default in zip(table, defaults, strict=True)
+    ]
+    return "\n".join(["parameters: --ros-args -p NAME:=VALUE -p ...", *lines])

@@ -27,12 +27,12 @@ from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import array_to_ros, single_from_ros
 from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import DRAIN_S, EVENTS, LATCHED
-from curation_ros.nodes.spinning import run
+from curation_ros.nodes.spinning import run, take_all
 from curation_ros.nodes.subscriptions import MappedSubscriptions
 from curation_ros.recording import Notice, RecordedTopic, Recording, recover_partials
 
 PARAMETERS = (
-    Parameter("dataset", "dataset", "folder that the bags go to; made where it does not exist"),
+    Parameter("dataset", "dataset", "folder of the bags; made where there is none", needed=True),
     Parameter("topic_map", "", "YAML file of the topic map; empty: the LIBERO robot of sim_node"),
     Parameter("auto", True, "follow the episode topic; false: driven by ~/start and ~/stop"),
     Parameter("task", "demo", "short names are <task>-<number>, when driven by hand"),
@@ -50,8 +50,8 @@ class Recorder(Node):
     def __init__(self) -> None:
         super().__init__("recorder")
         p = declare(self, PARAMETERS)
-        self._dataset = Dataset(Path(p["dataset"]).expanduser(), create=True)
         self._map = topic_map_or_default(p["topic_map"])
+        self._dataset = Dataset(Path(p["dataset"]).expanduser(), create=True)
         # Created before the data subscriptions: an executor serves ready ones in that order, so
         # `started` is taken before the samples that follow it.
         self._status = self.create_publisher(DiagnosticArray, "recorder/status", LATCHED)
@@ -74,7 +74,8 @@ class Recorder(Node):
         self.create_service(SetBool, "~/finalize", self._finalize)
         self._health = Health(self)
         self._last_id = ""
-        self._begun: dict[str, str] = {}  # id -> name, until its commands arrive
+        # id -> name and what was said to have arrived, until that is every topic
+        self._begun: dict[str, tuple[str, frozenset[str]]] = {}
         self._tell(recover_partials(self._dataset))
         self._by_hand: ByHand | None = None
         if not p["auto"]:
@@ -99,8 +100,6 @@ class Recorder(Node):
         if self._by_hand is not None and sample.topic == self._map.clock_topic:
             self._by_hand.clock_ns = sample.stamp_ns
         self._tell(self._recording.sample(sample, time.monotonic()))
-        if self._begun:
-            self._tell_commands_arrive()
 
     # --- services ---------------------------------------------------------------------------
 
@@ -142,6 +141,7 @@ class Recorder(Node):
         """Flush, close and report."""
         now_s = time.monotonic()
         self._tell(self._recording.tick(now_s))
+        self._tell_what_arrives()
         if self._health.due(now_s):
             problems = self._mapped.check(running=bool(self._recording.open_ids))
             self._recording.topics |= self._topics()
@@ -151,7 +151,9 @@ class Recorder(Node):
         return False
 
     def close(self) -> None:
-        """Close the open bag as aborted, with all it has; who owns the episode says so."""
+        """Close the open bag as aborted, with all that was sent; who owns the episode says so."""
+        if self._recording.open_ids:
+            take_all(self)
         was_open = bool(self._recording.open_ids)
         if self._by_hand is not None:
             self._by_hand.give_up(_STOPPED)
@@ -159,21 +161,28 @@ class Recorder(Node):
         if was_open:  # the curator must hear of it: it judges the bag, not what went on
             deliver([self._status])
 
-    def _tell_commands_arrive(self) -> None:
-        """Say once of an episode that its commands come here, too, so that its owner may go on."""
-        for episode_id, name in list(self._begun.items()):
-            counts = self._recording.counts(episode_id)
-            if all(counts.get(topic) for topic in self._map.command_topics):
+    def _tell_what_arrives(self) -> None:
+        """Say of an episode, once its commands come, which topics do, so that its owner may go on.
+
+        A topic without a sample counts 0; what is there later is said later.
+        """
+        for episode_id, (name, said) in list(self._begun.items()):
+            counts = dict.fromkeys(self._map.topics, 0) | self._recording.counts(episode_id)
+            arrived = frozenset(topic for topic, n in counts.items() if n)
+            if arrived == said or not arrived.issuperset(self._map.command_topics):
+                continue
+            self._begun[episode_id] = name, arrived
+            if len(arrived) == len(counts):
                 del self._begun[episode_id]
-                values = {"reason": "its commands arrive", **counts_to_values(counts)}
-                self._publish(Status(OK, name, f"recording {episode_id}", episode_id, values))
+            values = {"reason": "its commands arrive", **counts_to_values(counts)}
+            self._publish(Status(OK, name, f"recording {episode_id}", episode_id, values))
 
     def _tell(self, notices: Sequence[Notice]) -> None:
         for n in notices:
             self._last_id = n.id if n.state == "closed" else self._last_id
             self._begun.pop(n.id, None)
             if n.state == "recording":
-                self._begun[n.id] = n.name
+                self._begun[n.id] = n.name, frozenset()
             level = ERROR if n.state == "failed" else OK
             values = {"reason": n.reason or self._free()}
             values |= counts_to_values(n.counts)
@@ -203,7 +212,7 @@ class Recorder(Node):
 
 def main() -> int:
     """Entry point of `ros2 run curation_ros recorder`."""
-    return run(Recorder)
+    return run(Recorder, PARAMETERS)
 
 
 if __name__ == "__main__":

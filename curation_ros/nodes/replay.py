@@ -161,7 +161,7 @@ class Replay(Node):
 
 def main() -> int:
     """Entry point of `ros2 run curation_ros replay`."""
-    return run(Replay)
+    return run(Replay, PARAMETERS)
 
 
 if __name__ == "__main__":

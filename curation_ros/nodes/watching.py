@@ -1,4 +1,4 @@
-"""Watches episodes and decisions on the graph, for whoever shows them."""
+"""Watches episodes, alerts and decisions on the graph, for whoever shows them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from curation_ros.core.errors import CurationError
 from curation_ros.core.status import EpisodeEvent, Status, event_from_status
 from curation_ros.nodes.messages import single_from_ros
-from curation_ros.nodes.qos import DECISIONS, LATCHED
+from curation_ros.nodes.qos import DECISIONS, EVENTS, LATCHED
 
 
 class Watcher:
@@ -24,6 +24,7 @@ class Watcher:
 
     Attributes:
         events: of topic `episode`, oldest first.
+        alerts: of topic `curator/alert`, oldest first.
         decisions: of topic `curator/decision`, oldest first.
     """
 
@@ -35,6 +36,7 @@ class Watcher:
         """
         os.environ.update(environment)
         self.events: deque[EpisodeEvent] = deque()
+        self.alerts: deque[Status] = deque()
         self.decisions: deque[Status] = deque()
         self._context = rclpy.context.Context()
 
@@ -43,6 +45,7 @@ class Watcher:
         rclpy.init(context=self._context)
         self._node = rclpy.create_node("watcher", context=self._context)
         self._node.create_subscription(DiagnosticArray, "episode", self._on_episode, LATCHED)
+        self._node.create_subscription(DiagnosticArray, "curator/alert", self._on_alert, EVENTS)
         self._node.create_subscription(
             DiagnosticArray, "curator/decision", self._on_decision, DECISIONS
         )
@@ -66,6 +69,10 @@ class Watcher:
     def _on_episode(self, message: DiagnosticArray) -> None:
         with suppress(CurationError):  # the nodes complain of it
             self.events.append(event_from_status(single_from_ros(message)))
+
+    def _on_alert(self, message: DiagnosticArray) -> None:
+        with suppress(CurationError):
+            self.alerts.append(single_from_ros(message))
 
     def _on_decision(self, message: DiagnosticArray) -> None:
         with suppress(CurationError):

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from curation_ros.reporting.findings import Row, at_keep, groups, main_keep, named, stages
+from curation_ros.reporting.findings import (
+    Row,
+    at_keep,
+    groups,
+    has_scorers,
+    main_keep,
+    named,
+    stages,
+)
 from curation_ros.reporting.tables import number, percent, points, probability
 
 #: Below this an adjusted p counts.
@@ -13,7 +21,14 @@ ALPHA = 0.05
 
 def answers(found: Row) -> list[str]:
     """Three to five sentences; where data are missing they say so."""
-    return [_done(found), *_harm(found), *_detection(found), *_claims(found), *_looks(found)]
+    return [
+        _done(found),
+        *_harm(found),
+        *_decided(found),
+        *_detection(found),
+        *_claims(found),
+        *_looks(found),
+    ]
 
 
 def _done(found: Row) -> str:
@@ -45,6 +60,25 @@ def _harm(found: Row) -> Iterator[str]:
             )
             return
     yield "There are no outcomes yet of both everything and oracle: whether it hurts is open."
+
+
+def _decided(found: Row) -> Iterator[str]:
+    """What the curator made of the pools by itself, where the study has asked it."""
+    asked = [pool["curator"]["verdicts"] for pool in found["pools"].values() if "curator" in pool]
+    if not asked:
+        return
+
+    def total(verdict: str, label: str) -> int:
+        return sum(int(verdicts[verdict][label]) for verdicts in asked)
+
+    n_good, n_defective = (
+        sum(total(verdict, label) for verdict in asked[0]) for label in ("good", "defective")
+    )
+    yield (
+        f"Without a reference the curator keeps {total('keep', 'good')} of {n_good} good "
+        f"demonstrations and {total('keep', 'defective')} of {n_defective} defective ones, and "
+        f"salvages a beginning of {total('salvage', 'good')} and {total('salvage', 'defective')}."
+    )
 
 
 def _detection(found: Row) -> Iterator[str]:
@@ -79,7 +113,7 @@ def _detection(found: Row) -> Iterator[str]:
                 f"({_places(n)}, ties count)" + _rhos(rhos) + "."
             )
             return
-    if next(stages(found, "protocol", "screen"), None):
+    if next(stages(found, "protocol", "screen"), None) and has_scorers(found):
         yield "Too few scorers have outcomes to compare detection with success."
 
 
@@ -118,6 +152,8 @@ def _looks(found: Row) -> Iterator[str]:
     """How many scorers are of use, by the rows that cost no more."""
     for stage in stages(found, "protocol", "screen"):
         judged = [r for r in stage["rows"] if r["rival"] is not None]
+        if not judged and not has_scorers(found):
+            continue
         if not judged:
             yield f"Stage {stage['name']} has no outcomes of scorers yet."
             continue

@@ -35,13 +35,19 @@ _STYLES: dict[str, tuple[str, str]] = {
 _GREY, _DARK = "#767676", "#333333"
 _SUCCEEDED, _FAILED = "#0072B2", "#D55E00"
 #: Baselines that are drawn as lines across: row -> dashes.
-_LINES: dict[str, Any] = {"oracle": "--", "reference": "-.", "everything": ":"}
+_LINES: dict[str, Any] = {
+    "oracle": "--",
+    "reference": "-.",
+    "everything": ":",
+    "decided": (0, (8, 2)),
+    "decided+random_cut": (0, (1, 3)),
+}
 #: Least distance of two points in AUROC, so that equal ones can be told apart.
 _BESIDE = 0.02
 _TWIN = "_label_free"
 #: Where an SVG names an id.
 _USES = re.compile(r'(url\(#|href="#)([^)"]+)')
-_RC: Any = {  # typed by matplotlib as one of its 400 keys
+RC: Any = {  # typed by matplotlib as one of its 400 keys
     "svg.fonttype": "none",
     "svg.hashsalt": "curation",
     "font.family": "sans-serif",
@@ -100,7 +106,7 @@ def _together(panels: Sequence[Panel], size_in: tuple[float, float], columns: in
 
 
 def _svg(draw: Callable[[Canvas], None], size_in: tuple[float, float]) -> str:
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(RC):
         canvas = Canvas(figsize=size_in, layout="constrained")
         draw(canvas)
         _settle(canvas)
@@ -155,6 +161,11 @@ def _of(stage: Row) -> str:
     return (
         stage["name"] if stage["kind"] in stage["name"] else f"{stage['name']} ({stage['kind']})"
     )
+
+
+def safe(name: str) -> str:
+    """A name that may stand in a file's name."""
+    return "".join(c if c.isalnum() or c in "._-" else "_" for c in name)
 
 
 def spoken(name: str) -> str:
@@ -345,6 +356,40 @@ def _curve(
         low, high = [min(v) for v in rates.values()], [max(v) for v in rates.values()]
         color = look["color"]
         axes.fill_between(list(rates), low, high, color=color, alpha=0.18, lw=0, zorder=0)
+
+
+def margin_panel(
+    stage: Row, pool: str, variant: str, swept: Sequence[tuple[int, Row]], others: Sequence[Row]
+) -> Drawing:
+    """Success against how far before the break what is salvaged ends, control steps.
+
+    Args:
+        stage: of the rows.
+        pool: of the rows.
+        variant: of the rows.
+        swept: margin and row.
+        others: rows without a margin.
+    """
+    done = [{**row, "keep": margin} for margin, row in swept if row["rate"] is not None]
+
+    def draw(canvas: Canvas) -> None:
+        axes = canvas.subplots()
+        _lines(axes, others)
+        look = {"color": _SUCCEEDED, "marker": "o", "markerfacecolor": _SUCCEEDED}
+        _with_intervals(axes, done, "decided + salvaged", look)
+        for row in done:
+            seeds = [c["successes"] / c["n"] for c in row["counts"]]
+            axes.plot([row["keep"]] * len(seeds), seeds, ".", color=_GREY, markersize=5)
+        _success_axis(axes)
+        axes.set_xticks([margin for margin, _ in swept])
+        axes.set_xlabel("margin before the break, control steps")
+        axes.set_title(f"{_of(stage)}: {pool}, {variant}", loc="left")
+        _legend(canvas, axes, 1)
+
+    alt = f"success by margin, {pool}, {variant}: " + ", ".join(
+        f"{row['keep']} steps: {row['rate']:.0%}" for row in done
+    )
+    return Drawing(draw, alt)
 
 
 def contrast_panel(stage: Row) -> Drawing:

@@ -142,6 +142,11 @@ def is_plain(row: Row) -> bool:
     return bool(row["scorer"]) and "+" not in row["row"]
 
 
+def has_scorers(found: Row) -> bool:
+    """Whether any training set is what a scorer keeps."""
+    return any(row["scorer"] for stage in found["stages"] for row in stage["rows"])
+
+
 def keep_counts(rows: Sequence[Row]) -> list[int]:
     """How many scorers keep, of these rows."""
     return sorted({row["keep"] for row in rows if is_plain(row)})

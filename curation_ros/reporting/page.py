@@ -11,11 +11,13 @@ from curation_ros.reporting.findings import (
     Row,
     at_keep,
     groups,
+    has_scorers,
     is_plain,
     is_sweep,
     main_keep,
     stages,
 )
+from curation_ros.reporting.salvage_section import salvage_blocks
 
 _SCREEN = (
     "Screening: few seeds, many cells. These figures are for looking around; nothing is claimed "
@@ -39,15 +41,24 @@ def page(found: Row) -> Page:
     Args:
         found: results that `curation_ros.reporting.findings.check` accepts.
     """
+    ranked, kept = [], []
+    # A study that ranks by no scorer has nothing to show there, and nothing is missing.
+    if has_scorers(found) or not found["stages"]:
+        ranked = [
+            Section("Detection and success", tuple(_detection(found))),
+            Section("Conditions beside the paper's (Table II)", tuple(_conditions(found))),
+            Section("Success against the number kept", tuple(_keep_counts(found))),
+        ]
+        kept = [Section("Kept and discarded demonstrations", tuple(_traces(found)))]
+    salvaged = salvage_blocks(found)
     sections = (
         Section("What was asked, and the answer", (Points(tuple(answers(found))),)),
-        Section("Detection and success", tuple(_detection(found))),
-        Section("Conditions beside the paper's (Table II)", tuple(_conditions(found))),
-        Section("Success against the number kept", tuple(_keep_counts(found))),
+        *ranked,
+        *([Section("Salvage", salvaged)] if salvaged else []),
         Section("Planned contrasts", tuple(_contrasts(found))),
         Section("Detection and length beside the paper's (Table I)", tuple(_audits(found))),
         Section("Every training set", tuple(tables.all_rows(s) for s in found["stages"])),
-        Section("Kept and discarded demonstrations", tuple(_traces(found))),
+        *kept,
         Section("How it was done", tuple(_method(found))),
     )
     return Page(f"Study {found['name']}", found["question"], sections)
@@ -77,8 +88,8 @@ def _detection(found: Row) -> Iterator[Block]:
         "AUROC against success. The AUROC is of the score that ranks: with length controlled, but "
         "for length itself. Bars: 95 % intervals, of success over training seeds and starts; "
         "dots: the policy of each training seed. Points of nearly equal AUROC are drawn beside "
-        "each other. The paper's points with its standard deviations stand last. A scorer that "
-        "needs no fit on the reference has an open marker.",
+        "each other. The paper's points with its standard deviations stand last. A label-free "
+        "twin has an open marker.",
         [*drawings, figures.published_panel()],
     )
     for stage in found["stages"]:
@@ -138,7 +149,7 @@ def _sweep(found: Row, stage: Row, pool: str, variant: str, rows: Sequence[Row])
         figures.keep_panel(found, stage, pool, variant, rows, scorer) for scorer in scorers
     ]
     return figures.figure(
-        f"figure-keep-{_safe(stage['name'])}-{_safe(pool)}-{_safe(variant)}",
+        f"figure-keep-{figures.safe(stage['name'])}-{figures.safe(pool)}-{figures.safe(variant)}",
         f"Stage {stage['name']} ({stage['kind']}): success against the number kept. Bars: 95 % "
         "intervals; dots: the policy of each training seed; grey: mean and range of random "
         "draws; lines across: rows that keep no number. Below, the share of good demonstrations "
@@ -157,7 +168,7 @@ def _contrasts(found: Row) -> Iterator[Block]:
         if lacking:
             yield _missing(f"data for {len(lacking)} of {len(stage['contrasts'])} contrasts.")
         yield figures.figure(
-            f"figure-contrasts-{_safe(stage['name'])}",
+            f"figure-contrasts-{figures.safe(stage['name'])}",
             f"Stage {stage['name']}: planned contrasts with 95 % intervals; filled where the "
             "adjusted p is below 0.05.",
             [figures.contrast_panel(stage)],
@@ -190,7 +201,7 @@ def _traces(found: Row) -> Iterator[Block]:
         any_traces = True
         ends = [chosen[0]] if len(chosen) == 1 else [chosen[0], chosen[-1]]
         yield figures.figure(
-            f"figure-traces-{_safe(name)}",
+            f"figure-traces-{figures.safe(name)}",
             f"Pool {name}: what the scorers with the highest and the lowest AUROC keep and "
             "discard. Blue: succeeded, orange: failed. Every phase is drawn equally long.",
             [
@@ -223,6 +234,10 @@ def _method(found: Row) -> Iterator[Block]:
         yield Points(tuple(str(p) for p in found["problems"]))
     else:
         yield Text("The last run reported no problem.")
+    if found.get("stages_left_out"):
+        yield _missing(
+            f"the last run was not asked for stages {', '.join(found['stages_left_out'])}."
+        )
     yield Text(
         "Every figure here, the paper's excepted, stands in results.json, with the outcome of "
         "every rollout and the plan."
@@ -271,11 +286,14 @@ def _method(found: Row) -> Iterator[Block]:
 
 def _demonstrations(found: Row) -> Table:
     plan = found["plan"]
-    collected = {"reference": plan.get("reference", {}), **plan.get("pools", {})}
+    more = {"more": plan["more"]} if plan.get("more") else {}
+    collected = {"reference": plan.get("reference", {}), **more, **plan.get("pools", {})}
     rows = []
     for name, settings in collected.items():
         pool = found["pools"].get(name, {})
-        n = pool.get("n", found["reference"].get("n", tables.NOTHING))
+        n = pool.get("n", tables.NOTHING)
+        if name == "reference":
+            n = found["reference"].get("n", tables.NOTHING)
         steps, released = pool.get("steps"), pool.get("release_steps")
         rows.append(
             (
@@ -342,8 +360,3 @@ def _starts(names: Sequence[str]) -> str:
     if len(names) < 3:
         return ", ".join(names)
     return f"{len(names)}: {names[0]} to {names[-1]}"
-
-
-def _safe(name: str) -> str:
-    """A name that may stand in a file's name."""
-    return "".join(c if c.isalnum() or c in "._-" else "_" for c in name)

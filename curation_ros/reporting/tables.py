@@ -82,11 +82,14 @@ def needs(names: Sequence[str]) -> str:
 
 
 def good_of(row: Row) -> str:
-    """How many of the pool's demonstrations in a set succeeded."""
+    """How many of the pool's demonstrations in a set succeeded; those that are there whole."""
     if not row["n_pool"]:
         return NOTHING
-    n_good = row["n_good"]
-    return f"{n_good:g} of {row['n_pool']}" if n_good is not None else NOTHING
+    n_good, n_parts = row["n_good"], row.get("n_salvaged", 0)
+    if n_good is None:
+        return NOTHING
+    text = f"{n_good:g} of {row['n_pool'] - n_parts}"
+    return f"{text}, and {n_parts} parts" if n_parts else text
 
 
 def rival(row: Row) -> str:

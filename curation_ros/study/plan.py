@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,10 +30,22 @@ CONTROLS: dict[str, tuple[str, str, bool]] = {
         False,
     ),
     "reference": ("reference", "the trusted demonstrations alone", False),
+    "more": ("more clean demonstrations", "K of the dataset `more`", True),
+    "decided": ("object pose", "what the curator keeps whole by default, no reference", False),
+    "salvaged": (
+        "object pose",
+        "good beginnings of what the curator salvages; -M ends them M control steps before",
+        False,
+    ),
+    "random_cut": ("object pose", "the same episodes, each cut at a random step", False),
 }
+#: Terms that are what the curator decides: their needs are those of the scorer that decided.
+DECIDED = ("decided", "salvaged", "random_cut")
+#: Terms whose draw may be named; else each training seed has its own.
+_DRAWN = ("random", "shuffled", "random_cut")
 #: Most contrasts of a stage that confirms.
 MAX_CONTRASTS = 12
-_TERM = re.compile(r"([a-z_]+)(?:@([0-9]+))?(?:#([0-9]+))?(?:%([0-9]+))?")
+_TERM = re.compile(r"([a-z_]+)(?:-([0-9]+))?(?:@([0-9]+))?(?:#([0-9]+))?(?:%([0-9]+))?")
 
 
 @dataclass(frozen=True)
@@ -43,23 +55,27 @@ class Term:
     Attributes:
         name: a scorer, or one of CONTROLS.
         keep: how many to keep, best first; None where the set has a size of its own.
-        draw: of `random` and `shuffled`; None: every training seed has a draw of its own.
+        draw: of `random`, `shuffled` and `random_cut`; None: every training seed has a draw of
+            its own.
         wrong: of `button`: wrong presses of 100.
+        margin: of `salvaged`: control steps that the beginning ends before the break; None: the
+            curator's own margin.
     """
 
     name: str
     keep: int | None = None
     draw: int | None = None
     wrong: int = 0
+    margin: int | None = None
 
     @property
     def is_drawn(self) -> bool:
         """Whether training seeds have sets of their own."""
-        return self.name in ("random", "shuffled") and self.draw is None
+        return self.name in _DRAWN and self.draw is None
 
 
 def parse_row(text: str) -> tuple[Term, ...]:
-    """Terms of a training set such as `knn@16`, `random@16#3`, `button%10`, `reference+knn@16`.
+    """Terms of a training set such as `knn@16`, `random@16#3`, `button%10`, `decided+salvaged-15`.
 
     Raises:
         ConfigError: naming what is wrong.
@@ -70,19 +86,22 @@ def parse_row(text: str) -> tuple[Term, ...]:
         if not found or (found[1] not in SCORERS and found[1] not in CONTROLS):
             known = ", ".join((*CONTROLS, *SCORERS))
             raise ConfigError(f"training set {text!r}: {part!r} is none; known are {known}")
-        name, keep = found[1], int(found[2]) if found[2] else None
+        name, keep = found[1], int(found[3]) if found[3] else None
         sized = name in SCORERS or (CONTROLS[name][2] and name != "oracle")
         if (sized and not keep) or (keep is not None and not (sized or name == "oracle")):
             raise ConfigError(
                 f"training set {text!r}: {name} "
                 + ("needs a number to keep, as in " + name + "@16" if sized else "takes no @K")
             )
-        if found[3] is not None and name not in ("random", "shuffled"):
+        if found[4] is not None and name not in _DRAWN:
             raise ConfigError(f"training set {text!r}: {name} has no draws")
-        if (found[4] is None) == (name == "button"):
+        if (found[5] is None) == (name == "button"):
             raise ConfigError(f"training set {text!r}: %P is for button, as in button%10")
-        draw = None if found[3] is None else int(found[3])
-        terms.append(Term(name, keep, draw, int(found[4] or 0)))
+        if found[2] is not None and name != "salvaged":
+            raise ConfigError(f"training set {text!r}: -M is for salvaged, as in salvaged-15")
+        draw = None if found[4] is None else int(found[4])
+        margin = None if found[2] is None else int(found[2])
+        terms.append(Term(name, keep, draw, int(found[5] or 0), margin))
     return tuple(terms)
 
 
@@ -167,6 +186,7 @@ class StudyPlan:
         keep_for_audit: how many the audit's table keeps.
         selection_seed: orders equal scores, and draws the controls.
         looks_before: earlier looks at the official starts, in words; a line each.
+        more: parameters of the collection of further clean demonstrations; none: none are there.
     """
 
     name: str
@@ -184,12 +204,44 @@ class StudyPlan:
     keep_for_audit: int = 60
     selection_seed: int = 0
     looks_before: tuple[str, ...] = ()
+    more: Mapping[str, Any] = field(default_factory=dict)
     raw: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
     @property
     def hash(self) -> str:
         """Of the whole plan, contrasts included."""
         return hashlib.sha256(json.dumps(self.raw, sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
+    def collections(self) -> dict[str, Mapping[str, Any]]:
+        """Parameters of all collections, by the names of their datasets."""
+        more = {"more": self.more} if self.more else {}
+        return {"reference": self.reference, **more, **self.pools}
+
+    def only(self, names: Sequence[str]) -> StudyPlan:
+        """The plan with some of its stages, and the pools that these use; its hash stays.
+
+        Raises:
+            ConfigError: if there is no such stage.
+        """
+        known = [stage.name for stage in self.stages]
+        for name in names:
+            if name not in known:
+                raise ConfigError(f"no stage {name!r}; there are {', '.join(known)}")
+        stages = tuple(stage for stage in self.stages if stage.name in names)
+        used = {pool for stage in stages for pool, _, _ in stage.cells()}
+        pools = {name: pool for name, pool in self.pools.items() if name in used}
+        return replace(self, stages=stages, pools=pools)
+
+    def terms(self, pool: str) -> set[Term]:
+        """Everything that the rows of a pool are made of."""
+        return {
+            term
+            for stage in self.stages
+            for name, _, row in stage.cells()
+            if name == pool
+            for term in parse_row(row)
+        }
 
 
 def read_plan(path: Path) -> StudyPlan:
@@ -244,6 +296,8 @@ def _check(plan: StudyPlan) -> None:
         raise ConfigError(f"name {plan.name!r}: letters, digits, '.', '_' and '-' only")
     if not plan.stages or not plan.pools:
         raise ConfigError("a study needs pools and stages")
+    for name in {"reference", "more"} & set(plan.pools):
+        raise ConfigError(f"a pool cannot be called {name!r}: that is the name of a dataset")
     for name in plan.scorers:
         if name not in SCORERS:
             raise ConfigError(f"no scorer {name!r}; there are {', '.join(SCORERS)}")
@@ -268,9 +322,12 @@ def _check(plan: StudyPlan) -> None:
             if pool not in plan.pools:
                 raise ConfigError(f"{where}: no pool {pool!r}; there are {', '.join(plan.pools)}")
             for term in parse_row(row):
-                n = int(plan.pools[pool]["episodes"])
+                source = "more" if term.name == "more" else pool
+                if source not in plan.collections:
+                    raise ConfigError(f"{where}: {row!r}: the plan has no dataset {source!r}")
+                n = int(plan.collections[source]["episodes"])
                 if term.keep is not None and term.keep > n:
-                    raise ConfigError(f"{where}: {row!r} keeps more than the {n} of {pool}")
+                    raise ConfigError(f"{where}: {row!r} keeps more than the {n} of {source}")
                 if term.name in SCORERS and term.name not in plan.scorers:
                     raise ConfigError(f"{where}: {row!r}: {term.name} is none of the scorers")
 

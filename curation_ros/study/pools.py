@@ -1,13 +1,13 @@
 """Pools: the datasets of a study, scored; and the training sets that its rows name.
 
-Labels are read here, for the rows that say so (`oracle`, `worst`, `shuffled`, `button`) and for
-the figures about a set. No score sees one.
+Labels are read here, for the rows that say so (`oracle`, `worst`, `shuffled`, `button`, `more`)
+and for the figures about a set. No score and no decision of the curator sees one.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,18 +17,29 @@ import numpy as np
 from curation_ros.auditing import AuditSettings, audit, read_episodes, read_labels
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError, EpisodeError
+from curation_ros.core.examination import Span
 from curation_ros.core.scorers import SCORERS
 from curation_ros.core.scoring import Curation
 from curation_ros.core.selection import ranking, tie_key
 from curation_ros.core.stream import Floats
 from curation_ros.dataset import Dataset
-from curation_ros.study.plan import CONTROLS, StudyPlan, Term, parse_row
+from curation_ros.study.curated import (
+    Curated,
+    curate,
+    facts_of,
+    phases_alone,
+    phases_shown,
+)
+from curation_ros.study.plan import CONTROLS, DECIDED, StudyPlan, Term, parse_row
 
 if TYPE_CHECKING:
     from curation_ros.collecting import Collection
 
 #: Points that a phase of a trace is resampled to.
 POINTS_PER_PHASE = 8
+
+#: Fewest steps that a random cut leaves: the least that a policy can learn a motion from.
+_LEAST_STEPS = 2
 
 Row = dict[str, Any]
 Said = Callable[[str], None]
@@ -43,9 +54,13 @@ class TrainingSet:
         pool: whose demonstrations.
         row: as the plan has it.
         needs: what somebody must have to make it, sorted.
-        bags: folders of the bags, sorted by episode.
-        n_pool, n_good: how many come from the pool, and how many of these succeeded.
+        bags: folders of the bags, sorted by episode, each with the span to learn from,
+            nanoseconds from its start stamp; None: all of it.
+        n_pool: how many come from the pool.
+        n_good: how many of these that are there as a whole succeeded.
         n_reference: how many come from the reference.
+        n_salvaged: how many of the pool are there by a part alone.
+        n_more: how many come from `more`.
         tied: how many of equal score a hash decided between, at the cut.
     """
 
@@ -53,33 +68,45 @@ class TrainingSet:
     pool: str
     row: str
     needs: tuple[str, ...]
-    bags: tuple[Path, ...]
+    bags: tuple[tuple[Path, Span | None], ...]
     n_pool: int
     n_good: int
     n_reference: int
+    n_salvaged: int = 0
+    n_more: int = 0
     tied: int = 0
 
-    def to_json(self) -> Row:
-        """Plain data; bags by their names, which are the episodes' ids."""
+    def to_json(self, timelines: Mapping[str, Episode]) -> Row:
+        """Plain data; bags by their names, which are the episodes' ids.
+
+        Args:
+            timelines: id -> episode, its phases at least.
+        """
+        n_whole = self.n_pool - self.n_salvaged
+        spans = {bag.name: list(span) for bag, span in self.bags if span is not None}
         return {
             "pool": self.pool,
             "row": self.row,
             "set": self.id,
             "needs": list(self.needs),
-            "n": self.n_pool + self.n_reference,
+            "n": self.n_pool + self.n_reference + self.n_more,
             "n_pool": self.n_pool,
             "n_good": self.n_good,
             "n_reference": self.n_reference,
-            "contamination": 1 - self.n_good / self.n_pool if self.n_pool else None,
+            "n_salvaged": self.n_salvaged,
+            "n_more": self.n_more,
+            "contamination": 1 - self.n_good / n_whole if n_whole else None,
             "tied_at_cut": self.tied,
-            "episodes": [bag.name for bag in self.bags],
+            "episodes": [bag.name for bag, _ in self.bags],
+            **({"spans": spans} if spans else {}),
+            "phases": phases_shown([(bag.name, span) for bag, span in self.bags], timelines),
         }
 
 
 def collect_datasets(
     folder: Path, plan: StudyPlan, *, jobs: int, backend: str, said: Said
 ) -> tuple[dict[str, Dataset], int]:
-    """Collect what is missing of the reference (`reference`) and of the pools.
+    """Collect what is missing of the reference (`reference`), of `more` and of the pools.
 
     Returns:
         Datasets by name, and how many demonstrations were collected now.
@@ -90,10 +117,9 @@ def collect_datasets(
     """
     from curation_ros.collecting import collect
 
-    wanted = {"reference": plan.reference, **plan.pools}
     check_starts(plan)
     made, n_new = {}, 0
-    for name, settings in wanted.items():
+    for name, settings in plan.collections.items():
         collection = _collection(settings, name)
         problems, n_known, n = [], 0, 0
         for one in collect(folder / name, collection, jobs=jobs, backend=backend):
@@ -118,7 +144,7 @@ def check_starts(plan: StudyPlan) -> None:
     from sim_node.starts import start_names
 
     used: dict[str, str] = {}
-    for name, settings in {"reference": plan.reference, **plan.pools}.items():
+    for name, settings in plan.collections.items():
         for episode in _collection(settings, name).plan().values():
             owner = used.setdefault(episode.start, name)
             if owner != name:
@@ -162,6 +188,8 @@ class Pool:
         notes: of the audit.
         traces: what the report draws of each episode.
         facts: about the dataset.
+        timelines: id -> episode, its phases and stamps alone.
+        curated: what the curator decides; None where no row of the plan asks for it.
     """
 
     name: str
@@ -175,6 +203,8 @@ class Pool:
     notes: list[str] = field(default_factory=list)
     traces: list[Row] = field(default_factory=list)
     facts: Row = field(default_factory=dict)
+    timelines: dict[str, Episode] = field(default_factory=dict)
+    curated: Curated | None = None
 
 
 def score_pool(name: str, dataset: Dataset, reference: Sequence[Episode], plan: StudyPlan) -> Pool:
@@ -216,6 +246,13 @@ def score_pool(name: str, dataset: Dataset, reference: Sequence[Episode], plan: 
                 scores[scorer][episode.id] = score
     by_length = {"nothing", str(control["needs"])}
     truth = dataset.truth()
+    released = {i: int(t["release_step"]) for i, t in truth.items() if "release_step" in t}
+    timelines = {e.id: phases_alone(e) for e in episodes}
+    terms = [term for term in plan.terms(name) if term.name in DECIDED]
+    curated = None
+    if terms:
+        margins = {term.margin for term in terms if term.margin is not None}
+        curated = curate(episodes, sorted(margins))
     return Pool(
         name=name,
         dataset=dataset,
@@ -238,12 +275,17 @@ def score_pool(name: str, dataset: Dataset, reference: Sequence[Episode], plan: 
             "n_good": sum(good[e.id] for e in episodes),
             "n_starts": len({truth[e.id]["start"] for e in episodes}),
             "steps": [len(e) for e in episodes],
-            "release_steps": sorted(
-                int(truth[e.id]["release_step"]) for e in episodes if "release_step" in truth[e.id]
-            ),
+            "release_steps": sorted(released[e.id] for e in episodes if e.id in released),
             "length_control": control,
             "scoring_hash": curation.scoring_hash_,
+            **(
+                {"curator": facts_of(curated, good, released, timelines)}
+                if curated is not None
+                else {}
+            ),
         },
+        timelines=timelines,
+        curated=curated,
     )
 
 
@@ -252,9 +294,17 @@ def _needs(found: set[str]) -> tuple[str, ...]:
 
 
 def training_set(
-    pool: Pool, row: str, reference: Dataset, seed: int, draw: int = 0
+    pool: Pool,
+    row: str,
+    reference: Dataset,
+    seed: int,
+    draw: int = 0,
+    *,
+    more: Dataset | None = None,
 ) -> TrainingSet:
     """The demonstrations that a row of a study means.
+
+    Where two terms show the same demonstration, the one that shows more of it counts.
 
     Args:
         pool: whose.
@@ -262,37 +312,105 @@ def training_set(
         reference: the trusted demonstrations.
         seed: of equal scores and of the controls.
         draw: of the controls that name none.
+        more: further clean demonstrations, for `more@K`.
 
     Raises:
         CurationError: if there are too few to keep.
     """
-    chosen: set[str] = set()
+    chosen: dict[str, Span | None] = {}
     needs: set[str] = set()
-    n_reference, tied = 0, 0
+    n_reference, n_more, tied = 0, 0, 0
     bags: dict[str, Path] = {}
-    for term in parse_row(row):
+    for given in parse_row(row):
+        term = replace(given, draw=draw) if given.is_drawn else given
         if term.name == "reference":
             needs.add("reference")
             trusted = list(reference.bags())
             n_reference = len(trusted)
             bags |= {bag.name: bag for bag in trusted}
-            continue
-        ids, tied = _kept(pool, replace(term, draw=draw) if term.is_drawn else term, seed)
-        chosen |= set(ids)
-        needs |= set(pool.needs[term.name] if term.name in SCORERS else (CONTROLS[term.name][0],))
+        elif term.name == "more":
+            needs.add(CONTROLS["more"][0])
+            further = _further(more, term.keep or 0)
+            n_more = len(further)
+            bags |= {bag.name: bag for bag in further}
+        elif term.name in DECIDED:
+            parts = _decided(pool, term, seed)
+            needs |= _curated(pool).needs(parts)
+            chosen = _united(chosen, parts)
+        else:
+            ids, tied = _kept(pool, term, seed)
+            chosen = _united(chosen, dict.fromkeys(ids))
+            needs |= set(
+                pool.needs[term.name] if term.name in SCORERS else (CONTROLS[term.name][0],)
+            )
     bags |= {i: pool.dataset.bag_path(i) for i in chosen}
-    content = hashlib.sha256("\n".join(sorted(bags)).encode()).hexdigest()[:12]
     return TrainingSet(
-        id=content,
+        id=_content(bags, chosen),
         pool=pool.name,
         row=row,
         needs=_needs(needs),
-        bags=tuple(bags[i] for i in sorted(bags)),
+        bags=tuple((bags[i], chosen.get(i)) for i in sorted(bags)),
         n_pool=len(chosen),
-        n_good=sum(pool.good[i] for i in chosen),
+        n_good=sum(pool.good[i] for i, span in chosen.items() if span is None),
         n_reference=n_reference,
+        n_salvaged=sum(span is not None for span in chosen.values()),
+        n_more=n_more,
         tied=tied,
     )
+
+
+def _content(ids: Iterable[str], spans: Mapping[str, Span | None]) -> str:
+    """Hash of what is in a set; a whole demonstration counts by its id alone."""
+    lines = []
+    for i in sorted(ids):
+        span = spans.get(i)
+        lines.append(i if span is None else f"{i} {span[0]} {span[1]}")
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:12]
+
+
+def _united(
+    known: Mapping[str, Span | None], new: Mapping[str, Span | None]
+) -> dict[str, Span | None]:
+    """Demonstrations of both; of one that both have the longer part."""
+    found = dict(known)
+    for i, span in new.items():
+        held = found.get(i, (0, -1))
+        if span is None or (held is not None and span[1] - span[0] > held[1] - held[0]):
+            found[i] = span
+    return found
+
+
+def _further(more: Dataset | None, keep: int) -> list[Path]:
+    """The first of the further demonstrations by name, of those that succeeded."""
+    if more is None:
+        raise EpisodeError("more: there is no dataset of further demonstrations")
+    good = read_labels(more, "success")
+    names = {i: str(truth["name"]) for i, truth in more.truth().items()}
+    ids = sorted((i for i, is_good in good.items() if is_good), key=lambda i: names[i])
+    if len(ids) < keep:
+        raise EpisodeError(f"dataset {more.path}: {len(ids)} succeeded, cannot keep {keep}")
+    return [more.bag_path(i) for i in ids[:keep]]
+
+
+def _curated(pool: Pool) -> Curated:
+    if pool.curated is None:
+        raise EpisodeError(f"pool {pool.name!r}: the curator has not decided on it")
+    return pool.curated
+
+
+def _decided(pool: Pool, term: Term, seed: int) -> dict[str, Span | None]:
+    """What a term of the curator's decisions holds, each with its span."""
+    curated = _curated(pool)
+    if term.name == "decided":
+        return dict.fromkeys(curated.ids("keep"))
+    if term.name == "salvaged":
+        return dict(curated.prefixes[term.margin])
+    rng = np.random.default_rng([seed, term.draw or 0, 3])
+    cut: dict[str, Span | None] = {}
+    for i in sorted(curated.prefixes[None], key=lambda i: pool.names[i]):
+        episode = pool.timelines[i]
+        cut[i] = episode.span(0, int(rng.integers(_LEAST_STEPS - 1, len(episode))))
+    return cut
 
 
 def _kept(pool: Pool, term: Term, seed: int) -> tuple[list[str], int]:

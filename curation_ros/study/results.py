@@ -12,9 +12,10 @@ from typing import Any
 
 from curation_ros import __version__
 from curation_ros.core import policy_statistics as stats
+from curation_ros.core.episode import Episode
 from curation_ros.core.scorers import SCORERS
 from curation_ros.judging import Row
-from curation_ros.study.plan import Contrast, Stage, parse_row
+from curation_ros.study.plan import Contrast, Stage, StudyPlan, parse_row
 from curation_ros.study.running import Cell, Study
 
 #: Raised when a key changes its meaning.
@@ -24,6 +25,8 @@ _PACKAGES = (
     *("torch", "numba"),
 )
 
+#: Roles of the fields that a picture of an episode is drawn from.
+_SHOWN = ("effector", "object", "gripper", "phase")
 #: Needs that everybody can meet who has the demonstrations.
 _FREE = {"nothing", "dataset"}
 
@@ -57,6 +60,7 @@ def results(study: Study) -> Row:
             "policies": len({r["policy"] for r in judge.rows("policy") if r["status"] == "ok"}),
         },
         "reference": {"n": study.n_reference},
+        "stages_left_out": _left_out(plan),
         "pools": {
             name: {
                 **pool.facts,
@@ -70,6 +74,7 @@ def results(study: Study) -> Row:
             }
             for name, pool in study.pools.items()
         },
+        **_example(study),
         "stages": stages,
         "official_looks": {
             "before": list(plan.looks_before),
@@ -92,10 +97,41 @@ def _versions() -> dict[str, str]:
     return found
 
 
+def _left_out(plan: StudyPlan) -> list[str]:
+    """Stages of the plan that were not asked for."""
+    done = {stage.name for stage in plan.stages}
+    names = [str(stage["name"]) for stage in plan.raw["stages"]]
+    return [name for name in names if name not in done]
+
+
+def _example(study: Study) -> Row:
+    """A salvaged episode, with its decision: what the report's picture is drawn from."""
+    for name, pool in study.pools.items():
+        if pool.curated is None or pool.curated.example is None:
+            continue
+        episode = pool.curated.example
+        shown = [s.name for role in _SHOWN for s in episode.topic_map.with_role(role)]
+        return {
+            "salvaged_example": {
+                "pool": name,
+                "decision": pool.curated.decisions[episode.id].to_json(),
+                "start_ns": episode.start_ns,
+                "end_ns": episode.end_ns,
+                "stamps_ns": episode.stamps_ns.tolist(),
+                "fields": {k: episode.fields[k].round(4).tolist() for k in shown},
+            }
+        }
+    return {}
+
+
+def _keep(row: str) -> int | None:
+    """How many a row keeps of the pool, where it says a number."""
+    counts = (t.keep for t in parse_row(row) if t.name != "more" and t.keep is not None)
+    return next(counts, None)
+
+
 def _keep_counts(study: Study) -> list[int]:
-    counts = {
-        term.keep for cell in study.cells for term in parse_row(cell.row) if term.keep is not None
-    }
+    counts = {keep for cell in study.cells if (keep := _keep(cell.row)) is not None}
     return sorted({*counts, study.plan.keep_for_audit})
 
 
@@ -158,9 +194,9 @@ def _row(
     raw = scorer in SCORERS and not SCORERS[scorer].length_controlled
     row: Row = {
         "variant": cell.variant,
-        **_sets(cell),
+        **_sets(cell, study.timelines),
         "scorer": scorer,
-        "keep": next((t.keep for t in terms if t.keep is not None), None),
+        "keep": _keep(cell.row),
         "auroc": audited.get("auroc_raw" if raw else "auroc_controlled"),
         "auroc_ci": audited.get("ci_raw" if raw else "ci"),
         "auroc_raw": audited.get("auroc_raw"),
@@ -199,14 +235,23 @@ def _row(
     return row
 
 
-def _sets(cell: Cell) -> Row:
+def _sets(cell: Cell, timelines: Mapping[str, Episode]) -> Row:
     """What is in the training set; of one that is drawn for each seed the means, and no ids."""
     different = {made.id: made for made in cell.sets.values()}
-    described = [made.to_json() for made in different.values()]
+    described = [made.to_json(timelines) for made in different.values()]
     first = described[0]
     if len(described) == 1:
         return first
-    means = {key: mean(d[key] for d in described) for key in ("n_good", "contamination")}
+    first.pop("spans", None)
+    pure = [d["contamination"] for d in described if d["contamination"] is not None]
+    means = {
+        "n_good": mean(d["n_good"] for d in described),
+        "contamination": mean(pure) if pure else None,
+        "phases": {
+            phase: {key: mean(d["phases"][phase][key] for d in described) for key in counts}
+            for phase, counts in first["phases"].items()
+        },
+    }
     return {**first, **means, "set": "+".join(sorted(different)), "episodes": []}
 
 

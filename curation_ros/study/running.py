@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from curation_ros.auditing import read_episodes
+from curation_ros.core.episode import Episode
 from curation_ros.core.errors import CurationError
 from curation_ros.dataset import Dataset, append_line, named_errors, read_lines
 from curation_ros.judging import Judge, PolicyUnit, RolloutUnit, Row, Work
+from curation_ros.study.curated import phases_alone
 from curation_ros.study.plan import Stage, StudyPlan, parse_row
 from curation_ros.study.pools import (
     Pool,
@@ -76,6 +78,7 @@ class Study:
         problems: what failed or was not begun, a line each.
         seconds: what took how long, in all runs so far.
         n_reference: trusted demonstrations, how many.
+        timelines: id -> demonstration, its phases and stamps alone.
     """
 
     plan: StudyPlan
@@ -86,6 +89,7 @@ class Study:
     problems: tuple[str, ...]
     seconds: tuple[Row, ...]
     n_reference: int
+    timelines: Mapping[str, Episode] = field(default_factory=dict)
 
 
 def run_study(
@@ -98,6 +102,7 @@ def run_study(
     said: Said = lambda text: None,
     ticked: Ticked = lambda what, done, of: None,
     work: bool = True,
+    stages: Sequence[str] = (),
 ) -> Study:
     """Do what a plan says and an earlier run has not done.
 
@@ -110,12 +115,15 @@ def run_study(
         said: called with a line about each part.
         ticked: called as units are done.
         work: whether to train and roll out; False: only take stock.
+        stages: those to do, and to take stock of; none: all.
 
     Raises:
         ConfigError: if the plan makes no sense or is not the one that the folder was begun with.
         CurationError: if a dataset cannot be completed or scored, or a file cannot be written.
     """
     check_starts(plan)
+    if stages:
+        plan = plan.only(stages)
     clock = _Clock(folder / "seconds.jsonl", notes=work)
     with clock.measured("collect") as fact:
         datasets, fact["units"] = collect_datasets(
@@ -124,10 +132,17 @@ def run_study(
     reference, problems = read_episodes(datasets["reference"])
     if problems:
         raise CurationError(f"reference: {'; '.join(problems)}")
+    timelines = {e.id: phases_alone(e) for e in reference}
+    if "more" in datasets:
+        further, problems = read_episodes(datasets["more"])
+        if problems:
+            raise CurationError(f"more: {'; '.join(problems)}")
+        timelines |= {e.id: phases_alone(e) for e in further}
     pools = {}
     with clock.measured("score and audit"):
         for name in plan.pools:
             pools[name] = score_pool(name, datasets[name], reference, plan)
+            timelines |= pools[name].timelines
             said(f"pool {name}: {len(plan.scorers)} scorers, {pools[name].facts['n']} scored")
     judge = Judge(
         folder,
@@ -137,7 +152,7 @@ def run_study(
         gives_up=plan.gives_up,
         budget_steps=plan.budget_steps,
     )
-    cells = tuple(_cells(plan, pools, datasets["reference"]))
+    cells = tuple(_cells(plan, pools, datasets["reference"], datasets.get("more")))
     said(
         f"{len(cells)} cells, {len({p for c in cells for p in c.policies.values()})} policies; "
         f"{judge.used_steps} of {plan.budget_steps} simulation steps are used"
@@ -155,10 +170,13 @@ def run_study(
         problems=tuple(dict.fromkeys(found)),
         seconds=tuple(clock.all()),
         n_reference=len(reference),
+        timelines=timelines,
     )
 
 
-def _cells(plan: StudyPlan, pools: Mapping[str, Pool], reference: Dataset) -> Iterator[Cell]:
+def _cells(
+    plan: StudyPlan, pools: Mapping[str, Pool], reference: Dataset, more: Dataset | None
+) -> Iterator[Cell]:
     made: dict[tuple[str, str, int], TrainingSet] = {}
     for stage in plan.stages:
         for pool, variant, row in stage.cells():
@@ -169,7 +187,7 @@ def _cells(plan: StudyPlan, pools: Mapping[str, Pool], reference: Dataset) -> It
                 key = (pool, row, draw)
                 if key not in made:
                     made[key] = training_set(
-                        pools[pool], row, reference, plan.selection_seed, draw
+                        pools[pool], row, reference, plan.selection_seed, draw, more=more
                     )
                 sets[seed] = made[key]
             yield Cell(stage, variant, sets)
@@ -199,7 +217,7 @@ def _train(
             set_id=made.id,
             variant=cell.variant,
             seed=seed,
-            bags=tuple((bag, None) for bag in made.bags),
+            bags=made.bags,
             steps=plan.gradient_steps,
             selection=(f"{made.pool}/{made.row}", made.id),
         )

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scenes import LIFT_AT, RELEASE_AT, scene
 
 from curation_ros.auditing import PAPER
 from curation_ros.core import detection
+from curation_ros.core.episode import Episode
 from curation_ros.dataset import Dataset
 from curation_ros.judging import Judge
-from curation_ros.study.plan import StudyPlan, plan_from
+from curation_ros.study.curated import curate, facts_of, phases_alone
+from curation_ros.study.plan import DECIDED, StudyPlan, plan_from
 from curation_ros.study.pools import POINTS_PER_PHASE, Pool, training_set
 from curation_ros.study.results import results
 from curation_ros.study.running import Cell, Study
@@ -69,6 +74,27 @@ def small_plan(**changes: Any) -> StudyPlan:
     return plan_from({**raw, **changes})
 
 
+def salvage_plan() -> StudyPlan:
+    """What the curator decides, with a sweep of the margin, and contrasts."""
+    collected = {"episodes": 6, "contamination": 0.5, "defect": "early_release", "seed": 1}
+    stage = {"pools": ["some"], "variants": ["relative"], "seeds": [1, 2, 3]}
+    rows = ["decided", "decided+salvaged", "decided+random_cut"]
+    contrast = {"a": "decided+salvaged", "b": "decided", "pool": "some", "variant": "relative"}
+    stages = [
+        {
+            **stage, "name": "margins", "kind": "screen", "starts": "generated:22:4",
+            "rows": ["oracle", *rows, "decided+salvaged-{0,5,15}"],
+        },
+        {
+            **stage, "name": "sure", "kind": "confirm", "starts": "official:0:4",
+            "rows": ["everything", *rows], "contrasts": [contrast],
+        },
+    ]  # fmt: skip
+    return small_plan(
+        pools={"some": collected}, scorers=["knn", "length"], keep_for_audit=3, stages=stages
+    )
+
+
 def made_results(
     folder: Path, plan: StudyPlan, *, share: float = 1.0, problems: tuple[str, ...] = ()
 ) -> dict[str, Any]:
@@ -94,6 +120,7 @@ def made_results(
                 for seed in seeds
             }
             cells.append(Cell(stage, variant, sets))
+    timelines = {i: made for pool in pools.values() for i, made in pool.timelines.items()}
     judge = Judge(folder, max_steps=plan.max_steps, budget_steps=plan.budget_steps)
     with (folder / "units.jsonl").open("a") as log:
         for line in _units(cells, share, rng):
@@ -107,6 +134,7 @@ def made_results(
         problems=problems,
         seconds=({"what": "roll", "part": "paper", "units": 12, "steps": 99, "seconds": 1.25},),
         n_reference=3,
+        timelines=timelines,
     )
     made: dict[str, Any] = json.loads(json.dumps(results(study), allow_nan=False))
     return made
@@ -168,6 +196,13 @@ def _pool(folder: Path, name: str, plan: StudyPlan, rng: np.random.Generator) ->
                 "notes": ["12 abstained: <why>"] if scorer == "entropy" else [],
             }
         )
+    curated, timelines, released = None, {}, {}
+    if any(term.name in DECIDED for term in plan.terms(name)):
+        carried = list(_carried(good, rng))
+        margins = {t.margin for t in plan.terms(name) if t.margin is not None}
+        curated = curate([episode for episode, _ in carried], margins)
+        timelines = {e.id: phases_alone(e) for e, _ in carried}
+        released = {e.id: at for e, at in carried if not good[e.id]}
     return Pool(
         name=name,
         dataset=Dataset(folder / name, create=True),
@@ -189,8 +224,25 @@ def _pool(folder: Path, name: str, plan: StudyPlan, rng: np.random.Generator) ->
                 "mode": "shortest-reference", "value": None, "steps": 215, "needs": "reference",
             },
             "scoring_hash": "0" * 16,
+            **({"curator": facts_of(curated, good, released, timelines)} if curated else {}),
         },
+        timelines=timelines,
+        curated=curated,
     )  # fmt: skip
+
+
+def _carried(good: dict[str, bool], rng: np.random.Generator) -> Iterator[tuple[Episode, int]]:
+    """An object that is carried, or lost, under each id; and when it was let go."""
+    for k, (i, is_good) in enumerate(good.items()):
+        at = RELEASE_AT if is_good else LIFT_AT + 20 + 5 * k
+        made = scene(dropped_at=at, opened_at=at)
+        # Without noise a recording counts as frozen.
+        moving = ("eef_position", "bowl_position", "plate_position", "joint_position")
+        fields = {
+            name: values + (name in moving) * 1e-5 * rng.standard_normal(values.shape)
+            for name, values in made.fields.items()
+        }
+        yield replace(made, id=i, name=i, fields=fields), at
 
 
 def _trace(episode: str, good: bool) -> dict[str, Any]:

@@ -123,7 +123,7 @@ def test_episodes_without_a_label_or_in_the_reference_are_left_out_and_counted(
 
 def test_whether_both_labels_agree_is_said(dataset: Dataset, rng: np.random.Generator) -> None:
     episodes = _contaminated(dataset, rng)
-    assert "the labels 'defect' are the same on all 8 episodes" in (
+    assert "the labels 'defect' say the same of all 8 episodes" in (
         audit(dataset, episodes, settings=_settings()).notes
     )
     dataset.append_truth({"episode": episodes[0].id, "outcome": "failed"})

@@ -16,6 +16,7 @@ from curation_ros.configuration import (
     topic_map_or_default,
 )
 from curation_ros.core.errors import BagError, ConfigError
+from curation_ros.core.rules import RULES
 from curation_ros.core.scorers import DEFAULT_SCORERS
 from curation_ros.core.scoring import Curation
 from curation_ros.core.topic_map import read_topic_map
@@ -66,6 +67,7 @@ def test_every_key_of_the_file_is_used(tmp_path: Path) -> None:
         "length_value": 50,
         "scorer_params": {"knn": {"k": 3}},
         "rule_params": {"threshold": -1.5},
+        "salvage_margin_s": 0.25,
     }
     assert set(settings) == set(inspect.signature(Curation).parameters)
     curation = read_curation(_write(tmp_path, settings), {})
@@ -87,10 +89,15 @@ def test_override_wins_over_the_file_and_an_empty_one_does_not(tmp_path: Path) -
 
 
 def test_scorer_that_decides_is_added_to_those_that_are_asked_for(tmp_path: Path) -> None:
-    path = _write(tmp_path, {"rule_scorer": "knn"})
+    path = _write(tmp_path, {"rule": "threshold", "rule_scorer": "knn"})
     assert read_curation(path, {"scorers": ["length"]}).scorers == ("length", "knn")
     assert read_curation(path, {"scorers": ["knn", "length"]}).scorers == ("knn", "length")
-    assert read_curation(None, {"scorers": ["length"]}).scorers == ("length", "gripper_timing")
+    asked = RULES["evidence"].consults
+    for scorers in (["length"], ["length", asked[0]]):
+        expected = (*scorers, *(n for n in asked if n not in scorers), "gripper_timing")
+        assert read_curation(None, {"scorers": scorers}).scorers == expected
+    kept = _write(tmp_path, {"scorers": ["length", "gripper_timing"]})
+    assert read_curation(kept, {}).scorers == ("length", "gripper_timing")  # as it says
     undecided = read_curation(path, {"scorers": ["length"], "rule": "none"})
     assert undecided.scorers == ("length",)
 
@@ -126,7 +133,7 @@ def test_parameters_of_the_file_s_rule_are_not_those_of_another(tmp_path: Path) 
         ({"scorers": ["knn", "knn"]}, "expected names, each once"),
         ({"scorers": ["nose"]}, "no scorer 'nose'; there are smoothness"),
         ({"rule": ["threshold"]}, "'rule' is .* expected a name"),
-        ({"rule": "nose"}, "no rule 'nose'; there are threshold"),
+        ({"rule": "nose"}, "no rule 'nose'; there are evidence, threshold"),
         ({"rule_scorer": "nose"}, "rule_scorer 'nose'"),
         ({"length": "nose"}, "length control 'nose' is none of"),
         ({"length": "fixed"}, "'fixed' takes steps"),
@@ -138,8 +145,11 @@ def test_parameters_of_the_file_s_rule_are_not_those_of_another(tmp_path: Path) 
         ({"scorer_params": {"knn": {"nose": 2}}}, "'knn' has no parameter 'nose'"),
         ({"scorer_params": {"knn": {"k": "many"}}}, "k is 'many'"),
         ({"rule_params": [1]}, r"'rule_params' is \[1\], expected a mapping"),
-        ({"rule_params": {"nose": 1}}, "rule 'threshold'.*nose"),
-        ({"rule_params": {"threshold": "high"}}, "rule 'threshold'"),
+        ({"rule_params": {"nose": 1}}, "rule 'evidence'.*nose"),
+        ({"rule_params": {"threshold": "high"}}, "rule 'evidence'"),
+        ({"salvage_margin_s": "long"}, "expected a number of seconds, or null"),
+        ({"salvage_margin_s": -1}, "salvage_margin_s is -1"),
+        ({"salvage_margin_s": float("nan")}, "salvage_margin_s is nan"),
         ({"rule_params": {"threshold": float("nan")}}, "not finite"),
     ],
 )

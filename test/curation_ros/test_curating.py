@@ -483,8 +483,8 @@ def test_person_may_decide_on_a_bag_that_nobody_has_scored(dataset: Dataset) -> 
     [
         ("nobody", "keep", "Ada", "no episode has the id or name 'nobody'"),
         ("", "keep", "Ada", "no episode has the id or name ''"),
-        ("good", "salvage", "Ada", "expected keep, discard, review"),
-        ("good", "", "Ada", "expected keep, discard, review"),
+        ("good", "salvage", "Ada", "until when is not said"),
+        ("good", "", "Ada", "expected keep, salvage, discard, review"),
         ("good", "keep", "curator", "is no person"),
         ("good", "keep", "", "is no person"),
     ],
@@ -497,6 +497,22 @@ def test_override_that_makes_no_sense_is_refused_and_not_logged(
     with pytest.raises(EpisodeError, match=said):
         live.override(prefix, verdict, "", by)
     assert len(dataset.decisions(_good().id)) == 1
+
+
+def test_person_salvages_the_beginning_of_what_the_curator_kept(dataset: Dataset) -> None:
+    live = _curator(dataset)
+    _watch(live, _good(), _stream_of("good"))
+    whole = (0, _good().end_ns - _good().start_ns)
+    cut = override(dataset, "good", "salvage", "it shook", "Ada", "", until_s=4.15)
+    assert (cut.verdict, cut.by, cut.span) == ("salvage", "Ada", (0, 4_150_000_000))
+    assert cut.reason == f"Ada: it shook; kept until 4.15 s of {whole[1] / 1e9:.2f} s"
+    # A later cut may reach further than an earlier one, and to keep is to keep all of it.
+    later = override(dataset, "good", "salvage", "", "Ada", "", until_s=6.0)
+    assert later.span == (0, 6_000_000_000)
+    assert live.override("good", "keep", "", "Ada").span == whole
+    with pytest.raises(EpisodeError, match="only what is salvaged is kept until then"):
+        override(dataset, "good", "keep", "", "Ada", "", until_s=2.0)
+    assert len(dataset.decisions(_good().id)) == 4
 
 
 def test_override_of_what_two_episodes_are_called_is_refused(dataset: Dataset) -> None:

@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from curation_ros.core.selection import Entry, Manifest
 from curation_ros.curating import override
 from curation_ros.dataset import Dataset
 from curation_ros.exporting import COLUMNS, FORMATS, export, keep_json
+from curation_ros.selecting import save_selection
 
 VERDICTS = ("keep", "salvage", "review", "discard")
 SPAN = (1, 50_000_000)
@@ -126,6 +128,38 @@ def test_csv_has_a_row_an_episode_and_every_column(
     assert [rows[f"pick-{k}"]["selected"] for k in range(5)] == ["True", "True", *["False"] * 3]
     undecided = rows["pick-4"]
     assert (undecided["decision"], undecided["score/knn"], undecided["findings"]) == ("", "", "")
+
+
+def test_csv_says_which_part_is_kept_beside_what_was_decided(
+    dataset: Dataset, decided: list[Episode], tmp_path: Path
+) -> None:
+    export(dataset, tmp_path / "all.csv", "csv")
+    rows = _rows(tmp_path / "all.csv")
+    kept = {name: row["selected_spans"] for name, row in rows.items()}
+    assert kept == {"pick-0": "all", "pick-1": f"{SPAN[0]}:{SPAN[1]}"} | {
+        f"pick-{k}": "" for k in (2, 3, 4)
+    }
+    assert rows["pick-1"]["span_end_ns"] == str(SPAN[1])
+    save_selection(dataset, rule="all", name="whole")
+    export(dataset, tmp_path / "whole.csv", "csv", selection="whole")
+    rows = _rows(tmp_path / "whole.csv")
+    assert {row["selected_spans"] for row in rows.values()} == {"all"}
+    assert rows["pick-1"]["span_end_ns"] == str(SPAN[1])
+
+
+def test_two_spans_of_an_episode_are_both_in_its_row(
+    dataset: Dataset, decided: list[Episode], tmp_path: Path
+) -> None:
+    manifest, _ = save_selection(dataset, rule="decisions", name="one")
+    [salvaged] = [e for e in manifest.entries if e.span is not None]
+    later = replace(salvaged, span=(60_000_000, 90_000_000))
+    dataset.save_manifest(replace(manifest, name="two", entries=(salvaged, later)))
+    for file_format in ("csv", "parquet"):
+        export(dataset, tmp_path / file_format, file_format, selection="two")
+    row = _rows(tmp_path / "csv")["pick-1"]
+    assert row["selected_spans"] == f"{SPAN[0]}:{SPAN[1]} 60000000:90000000"
+    column = pq.read_table(tmp_path / "parquet").column("selected_spans").to_pylist()
+    assert sorted(filter(None, column)) == [row["selected_spans"]]
 
 
 def test_parquet_holds_the_same_with_types(

@@ -583,8 +583,8 @@ def test_killed_recorder_loses_at_most_one_flush_period(dataset: Dataset) -> Non
     assert _left(dataset) == []
     assert recover_partials(dataset) == []
     dataset.refresh()
-    [row] = dataset.rows("SELECT recovered, name FROM episodes")
-    assert tuple(row) == (1, episode.name)
+    [row] = dataset.rows("SELECT recovered, name, end_ns FROM episodes")
+    assert tuple(row) == (1, episode.name, built.stamps_ns[-1])
 
 
 def test_bag_of_a_living_recorder_is_left_alone(

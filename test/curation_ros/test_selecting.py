@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from episodes import make_episode
 from streams import record, same_arrays, short_episode
 
+from curation_ros.core.balance import balance_of, phase_steps
 from curation_ros.core.decisions import CURATOR, Decision
 from curation_ros.core.episode import Episode
 from curation_ros.core.errors import BagError, ConfigError, CurationError
+from curation_ros.core.phases import PHASES
 from curation_ros.core.selection import tie_key
 from curation_ros.curating import override
 from curation_ros.dataset import Dataset
@@ -180,6 +183,38 @@ def test_ties_without_a_known_start_go_by_the_id(
     episodes = _scored(dataset, rng, [0.0] * 5)
     keys = sorted((e.id for e in episodes), key=lambda i: tie_key(3, i))
     assert _kept(dataset, rule="top-k", value=2, scorer="knn", seed=3) == keys[:2]
+
+
+# --- phases -------------------------------------------------------------------------------------
+
+
+def test_phases_of_what_is_kept_are_counted(dataset: Dataset, rng: np.random.Generator) -> None:
+    whole, cut, left = (make_episode(rng, name=f"pick-{k}") for k in range(3))
+    for episode in (whole, cut, left):
+        record(dataset, episode)
+    half = (0, 7_000_000_000)
+    _decide(dataset, whole, {})
+    _decide(dataset, cut, {}, verdict="salvage", span=half)
+    _decide(dataset, left, {}, verdict="discard")
+    manifest, path = save_selection(dataset, rule="decisions")
+    trained_on = [(whole.id, phase_steps(whole)), (cut.id, phase_steps(cut, half))]
+    assert manifest.phases == balance_of(trained_on)
+    assert read_manifest(path)[0].phases == manifest.phases
+    shown = manifest.phases.phases
+    assert {name: s.demonstrations for name, s in shown.items()} == dict.fromkeys(PHASES, 2) | {
+        "TRANSPORT": 1,
+        "RELEASE": 1,
+    }
+
+
+def test_phases_of_a_bag_that_cannot_be_read_are_not_known(
+    dataset: Dataset, rng: np.random.Generator
+) -> None:
+    first, second = _recorded(dataset, rng, 2)
+    [file] = dataset.bag_path(second.id).glob("*.mcap")
+    file.write_bytes(b"")
+    manifest, _ = save_selection(dataset, rule="all")
+    assert manifest.phases == balance_of([(first.id, phase_steps(first)), (second.id, None)])
 
 
 # --- what is refused ----------------------------------------------------------------------------

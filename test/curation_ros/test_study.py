@@ -106,10 +106,11 @@ def test_sets_hold_what_their_names_say(study: Study) -> None:
     def episodes(row: str, draw: int = 0) -> set[str]:
         made = training_set(pool, row, study.reference, 0, draw)
         assert (made.n_pool, made.n_good) == (
-            len({b.name for b in made.bags} & set(pool.episodes)),
-            len({b.name for b in made.bags} & good),
+            len({b.name for b, _ in made.bags} & set(pool.episodes)),
+            len({b.name for b, _ in made.bags} & good),
         )
-        return {bag.name for bag in made.bags}
+        assert all(span is None for _, span in made.bags)
+        return {bag.name for bag, _ in made.bags}
 
     trusted = {bag.name for bag in study.reference.bags()}
     assert episodes("everything") == set(pool.episodes)
@@ -211,6 +212,7 @@ def test_what_the_budget_does_not_bear_is_missing_and_said(
     [
         ({"reference": {"episodes": 2, "starts": "generated:2:2"}}, "used by reference and by"),
         ({"reference": {"episodes": 2, "starts": "generated:3:2"}}, "'look': start generated-3-0"),
+        ({"more": {"episodes": 2, "starts": "generated:1:2"}}, "used by reference and by more"),
         ({"reference": {"episodes": 2, "seeds": 3}}, "dataset 'reference': .*seeds"),
     ],
 )
@@ -262,3 +264,65 @@ def test_a_study_of_other_rules_is_not_mixed_in(data: Path, study: Study) -> Non
     plan: StudyPlan = plan_from({**RAW, "gives_up": False})
     with pytest.raises(ConfigError, match="have gives_up True, not False"):
         run_study(plan, study.judge.folder, data)
+
+
+# --- what the curator decides -------------------------------------------------------------------
+
+CURATED: dict[str, Any] = {
+    **RAW,
+    "name": "curated",
+    "more": {"episodes": 1, "seed": 5, "starts": "generated:5:1"},
+    "stages": [
+        {
+            **RAW["stages"][0],
+            "rows": ["decided", "decided+salvaged", "decided+salvaged-5", "decided+random_cut"],
+            "contrasts": [],
+        },
+        {
+            **{"name": "sure", "kind": "confirm", "pools": ["paired"], "variants": ["relative"]},
+            **{"seeds": [3, 4], "starts": "generated:4:2"},
+            "rows": ["decided+salvaged", "oracle+more@1"],
+        },
+    ],
+}
+
+
+def test_a_study_of_what_is_salvaged_is_run_stage_by_stage(
+    tmp_path: Path, data: Path, study: Study
+) -> None:
+    plan = tmp_path / "plan.yaml"
+    plan.write_text(yaml.safe_dump(CURATED))
+    command = ["benchmark", "--config", str(plan), "--out", str(tmp_path), "--data", str(data)]
+    assert main([*command, "--no-report", "--jobs", "1", "--stage", "look"]) == 0
+    found = json.loads((tmp_path / "curated" / "results.json").read_text())
+    assert [stage["name"] for stage in found["stages"]] == ["look"]
+    assert (found["stages_left_out"], found["problems"]) == (["sure"], [])
+    rows = rows_of(found)
+    truth = Dataset(data / "paired").truth()
+    facts = found["pools"]["paired"]["curator"]
+    assert facts["verdicts"]["keep"] == {"good": 2, "defective": 0}
+    assert facts["verdicts"]["salvage"] == {"good": 0, "defective": 3}
+    assert facts["cut_minus_release"]["max"] < 0
+    assert rows["decided+salvaged"]["n_salvaged"] == 3
+    assert rows["decided"]["phases"]["RELEASE"]["demonstrations"] == 2
+    assert rows["decided+salvaged"]["phases"]["RELEASE"]["demonstrations"] == 2
+    assert rows["decided+salvaged"]["phases"]["LIFT"]["demonstrations"] > 2
+    for i, (first, last) in rows["decided+salvaged-5"]["spans"].items():
+        assert (first, truth[i]["defect"]) == (0, "early_release")
+        assert last > rows["decided+salvaged"]["spans"][i][1]
+    assert "+" in rows["decided+random_cut"]["set"]
+    example = found["salvaged_example"]
+    assert (example["pool"], example["decision"]["verdict"]) == ("paired", "salvage")
+    assert "bowl_position" in example["fields"]
+
+    assert main([*command, "--no-report", "--jobs", "1"]) == 0
+    found = json.loads((tmp_path / "curated" / "results.json").read_text())
+    assert (found["stages_left_out"], found["problems"]) == ([], [])
+    more = found["stages"][1]["rows"][1]
+    assert (more["n"], more["n_pool"], more["n_more"]) == (3, 2, 1)
+    trained = [
+        json.loads(line)["policy"]
+        for line in (tmp_path / "curated" / "units.jsonl").read_text().splitlines()
+        if json.loads(line)["kind"] == "policy"
+    ]
+    assert len(trained) == len(set(trained)) == 10

@@ -42,7 +42,7 @@ def changed(change: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     return raw
 
 
-@pytest.mark.parametrize("name", ["paper", "question"])
+@pytest.mark.parametrize("name", ["paper", "question", "salvage"])
 def test_the_plans_of_the_repository_are_whole(name: str) -> None:
     plan = read_plan(CONFIG / f"{name}.yaml")
     assert plan.name == name
@@ -64,6 +64,11 @@ def test_rows_are_read_term_by_term() -> None:
     assert parse_row("oracle") == (Term("oracle"),)
     assert parse_row("random@16")[0].is_drawn
     assert not parse_row("random@16#0")[0].is_drawn
+    assert parse_row("decided+salvaged-15") == (Term("decided"), Term("salvaged", margin=15))
+    assert parse_row("salvaged-0")[0].margin == 0
+    assert parse_row("salvaged")[0].margin is None
+    assert parse_row("random_cut")[0].is_drawn
+    assert parse_row("oracle+more@16") == (Term("oracle"), Term("more", 16))
 
 
 @pytest.mark.parametrize(
@@ -76,6 +81,10 @@ def test_rows_are_read_term_by_term() -> None:
         ("knn@3#1", "knn has no draws"),
         ("button", "%P is for button"),
         ("knn@3%10", "%P is for button"),
+        ("decided-15", "-M is for salvaged"),
+        ("decided@3", "decided takes no @K"),
+        ("salvaged#2", "salvaged has no draws"),
+        ("more", "more needs a number to keep"),
         ("", "is none"),
         ("knn@16+", "is none"),
     ],
@@ -120,6 +129,12 @@ def test_sets_of_contrasts_are_worked_on_and_none_twice() -> None:
         (lambda r: r["stages"].append(r["stages"][0]), "a name is there twice"),
         (lambda r: r["stages"][0].update(contrasts=[{"a": "oracle"}]), "contrast: no key 'b'"),
         (lambda r: r["stages"][0].update(draw_seeds=4), "draw_seeds 4 of 3 seeds"),
+        (lambda r: r["stages"][0].update(rows=["more@2"]), "the plan has no dataset 'more'"),
+        (
+            lambda r: (r.update(more={"episodes": 2}), r["stages"][0].update(rows=["more@3"])),
+            "keeps more than the 2 of more",
+        ),
+        (lambda r: r["pools"].update(more={"episodes": 2}), "a pool cannot be called 'more'"),
     ],
 )
 def test_plans_that_make_no_sense_are_refused(
@@ -157,3 +172,24 @@ def test_a_plan_without_scorers_takes_all() -> None:
 def test_every_change_of_a_plan_changes_its_hash() -> None:
     other = changed(lambda r: r["stages"][0].update(seeds=[1, 2, 4]))
     assert plan_from(RAW).hash == plan_from(deepcopy(RAW)).hash != plan_from(other).hash
+
+
+def test_the_contrasts_of_salvage_are_twelve_and_the_margin_is_looked_for_before() -> None:
+    margins, confirmation = read_plan(CONFIG / "salvage.yaml").stages
+    assert (margins.kind, len(margins.contrasts)) == ("screen", 0)
+    assert (confirmation.kind, len(confirmation.contrasts)) == ("confirm", 12)
+    assert "official" not in margins.starts
+    # Contrasts add no training set to those that are listed; independent starts come first.
+    assert len(confirmation.cells()) == 4 * len(confirmation.rows)
+    pools = list(dict.fromkeys(pool for pool, _, _ in confirmation.cells()))
+    assert pools == ["independent_16", "independent_6", "paired_16", "paired_6"]
+
+
+def test_some_stages_of_a_plan_are_these_and_what_they_use() -> None:
+    plan = read_plan(CONFIG / "salvage.yaml")
+    some = plan.only(["margins"])
+    assert [stage.name for stage in some.stages] == ["margins"]
+    assert list(some.pools) == ["independent_16", "independent_6"]
+    assert some.hash == plan.hash
+    with pytest.raises(ConfigError, match="no stage 'margin'; there are margins, confirmation"):
+        plan.only(["margin"])

@@ -49,7 +49,12 @@ def free(graph):
 
 
 def by_hand(graph, service):
-    answer = graph.call(Trigger, f"free_recorder/{service}", Trigger.Request())
+    def press():
+        return graph.call(Trigger, f"free_recorder/{service}", Trigger.Request())
+
+    answer = press()
+    if answer.message.startswith("nothing has arrived"):  # it does not know the sim yet
+        answer = graph.until(lambda: (a := press()).success and a, "the recorder hears the sim")
     assert answer.success, answer.message
     return answer
 

@@ -40,13 +40,5 @@ SCORERS: dict[str, type[Scorer]] = {
     "trajectory_alignment_label_free": LabelFreeTrajectoryAlignment,
 }
 
-#: Those of what became of the object need a graph that shows it, a twin the whole dataset: both
-#: must be asked for.
-_WHEN_ASKED = ("object_coupling", "grip_consistency", "phase_events")
-
-#: What scores where nothing is asked for.
-DEFAULT_SCORERS = tuple(
-    name
-    for name, scorer in SCORERS.items()
-    if scorer.needs != "dataset" and name not in _WHEN_ASKED
-)
+#: What scores where nothing is asked for: a twin needs the whole dataset, so it must be asked for.
+DEFAULT_SCORERS = tuple(name for name, scorer in SCORERS.items() if scorer.needs != "dataset")

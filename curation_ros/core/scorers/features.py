@@ -127,7 +127,7 @@ def start_state(episode: Episode) -> Floats:
     missing = [spec.name for spec in specs if spec.name not in episode.fields]
     if missing:
         raise Abstain(f"its start lacks the field {missing[0]!r}")
-    start = np.concatenate([episode.fields[spec.name][0] for spec in specs])
+    start: Floats = np.concatenate([episode.fields[spec.name][0] for spec in specs])
     if not np.isfinite(start).all():
         raise Abstain("its start is not finite")
     return start

@@ -8,7 +8,12 @@ from curation_ros.core.carrying import Carrying
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.grip import grip_of
 from curation_ros.core.scorers.features import checked_command
-from curation_ros.core.scorers.object_coupling import known, lost_steps, seconds
+from curation_ros.core.scorers.object_coupling import (
+    known,
+    lost_steps,
+    opened_too_early,
+    seconds,
+)
 from curation_ros.core.scorers.scorer import Scorer
 
 if TYPE_CHECKING:
@@ -26,7 +31,7 @@ class GripConsistency(Scorer):
     make it sure.
 
     Without these phases in the topic map, the time from half a second after a closing command to
-    the opening counts: then only fingers that close on nothing can be told.
+    the opening counts: it abstains then but for what slips out of the fingers.
 
     Abstains without fingers (or effort) in the topic map, and where the episode ends in
     mid-carry. It looks at the whole episode, whatever the length control.
@@ -35,6 +40,7 @@ class GripConsistency(Scorer):
     needs = "nothing"
     length_controlled = False
     resolution = 0.02
+    version = 2
     choices: ClassVar = {"on": ("fingers", "effort")}
 
     def __init__(self, *, on: str = "fingers", effort: str = "") -> None:
@@ -72,10 +78,14 @@ class GripConsistency(Scorer):
         where = f", in {hold.phase}" if hold.phase else ""
         return (
             f"the fingers {'had let go' if hold.opened else 'held nothing'} at "
-            f"{seconds(episode, hold.departed):.1f} s{where}, as {hold.object} shows"
+            f"{seconds(episode, hold.departed):.2f} s{where}, as {hold.object} shows"
         )
+
+    def broke_at(self, episode: Episode) -> int | None:
+        """The command to open, or the first step without a grip if that was before."""
+        return opened_too_early(episode, self._grip(episode))
 
     def _grip(self, episode: Episode) -> Carrying:
         self.check_params()
         checked_command(episode)
-        return known(grip_of(episode, effort=self.effort))
+        return known(episode, grip_of(episode, effort=self.effort))

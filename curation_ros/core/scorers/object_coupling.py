@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from curation_ros.core.carrying import Carrying, Hold, carrying_of
+import numpy as np
+
+from curation_ros.core.carrying import Carrying, Hold, carry_labels, carrying_of
+from curation_ros.core.errors import EpisodeError
+from curation_ros.core.gripper import commanded
 from curation_ros.core.scorers.features import checked_command
 from curation_ros.core.scorers.scorer import Abstain, Scorer
 from curation_ros.core.stream import NS_PER_S
@@ -20,12 +24,14 @@ class ObjectCoupling(Scorer):
     its distance from the effector does not grow: an object that turns in the fingers (a bowl that
     is held by its rim tilts by 2 to 3 cm) keeps that distance, one that falls or stays behind
     does not. Growth beyond 15 mm and half the noise of the pose adds up from step to step, and
-    beyond 12 mm and four times that noise it is sure (a CUSUM test); the noise is measured on the
-    object at rest before the grasp. The reference follows slowly, so that an object may settle.
-    What is opened in TRANSPORT and does not fall was put down.
+    beyond 12 mm and four times that noise it is sure (a CUSUM test), beyond two thirds of that
+    after a command to open; the noise is measured on the object at rest before the grasp. The
+    reference follows slowly, so that an object may settle. What is opened in TRANSPORT and does
+    not fall was put down.
 
     Without these phases in the topic map, the time from half a second after a closing command to
-    the opening counts: an early opening is then no break, as nobody says where the goal is.
+    the opening counts: an early opening is then no break, as nobody says where the goal is, nor
+    whether anything was to be carried; it abstains but for what slips.
 
     Abstains, with what it could not know, where an object has no pose, its pose freezes or jumps
     (to another object, perhaps), two objects are equally near, or the episode ends in mid-carry.
@@ -37,6 +43,7 @@ class ObjectCoupling(Scorer):
     needs = "object pose"
     length_controlled = False
     resolution = 0.02
+    version = 2
 
     def score(self, episode: Episode) -> float:
         """1: carried all the way; less: it left at that share of the way; 0: never carried."""
@@ -54,21 +61,24 @@ class ObjectCoupling(Scorer):
         where = f", in {hold.phase}" if hold.phase else ""
         if hold.state == "never":
             left_s = seconds(episode, hold.departed)
-            return f"{hold.object} was not taken along: left behind at {left_s:.1f} s{where}"
-        after_s = seconds(episode, hold.noticed) - seconds(episode, hold.departed)
+            return f"{hold.object} was not taken along: left behind at {left_s:.2f} s{where}"
         return (
-            f"{hold.object} left the effector at {seconds(episode, hold.departed):.1f} s{where}"
-            f"{', opened' if hold.opened else ''}; {after_s:.2f} s later it was "
-            f"{hold.gap_m:.3f} m farther away"
+            f"{hold.object} left the effector at {seconds(episode, hold.departed):.2f} s{where}"
+            f"{', opened' if hold.opened else ''}; at {seconds(episode, hold.noticed):.2f} s it "
+            f"was {hold.gap_m:.3f} m farther away"
         )
+
+    def broke_at(self, episode: Episode) -> int | None:
+        """The command to open, or the first step of leaving if that was before."""
+        return opened_too_early(episode, self._carrying(episode))
 
     def _carrying(self, episode: Episode) -> Carrying:
         if episode.topic_map.gripper is not None:
             checked_command(episode)
-        return known(carrying_of(episode))
+        return known(episode, carrying_of(episode))
 
 
-def known(carrying: Carrying) -> Carrying:
+def known(episode: Episode, carrying: Carrying) -> Carrying:
     """What became of what was grasped, if that is known.
 
     Raises:
@@ -77,7 +87,31 @@ def known(carrying: Carrying) -> Carrying:
     worst = carrying.worst
     if worst is None or worst.state == "unknown":
         raise Abstain(carrying.reason if worst is None else worst.reason)
+    if worst.state != "broken" and not carry_labels(episode.topic_map):
+        raise Abstain(
+            "it was held until the gripper opened; without phases, maybe too early"
+            if worst.state == "carried"
+            else "nothing was taken along; without phases, maybe nothing was to be"
+        )
     return carrying
+
+
+def opened_too_early(episode: Episode, carrying: Carrying) -> int | None:
+    """Step at which a hold began to break by a command to open; None where none broke so.
+
+    A noisy pose may seem to leave a little before that command, or after it: the earlier of the
+    two counts. What slips out of closed fingers may have been grasped badly: how far back the
+    episode is bad then, nobody knows.
+    """
+    hold = carrying.worst
+    if hold is None or hold.state != "broken" or hold.departed is None or hold.noticed is None:
+        return None
+    try:
+        is_open = commanded(episode) > 0
+    except EpisodeError:
+        return None
+    opened = np.flatnonzero(is_open[hold.first : hold.noticed + 1])
+    return min(hold.departed, hold.first + int(opened[0])) if len(opened) else None
 
 
 def lost_steps(carrying: Carrying) -> tuple[int, int] | None:

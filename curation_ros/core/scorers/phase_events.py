@@ -66,9 +66,14 @@ class PhaseEvents(Scorer):
         if step is None:
             return None
         return (
-            f"the gripper was opened at {seconds(episode, step):.1f} s, "
+            f"the gripper was opened at {seconds(episode, step):.2f} s, "
             f"after {share:.0%} of {label}"
         )
+
+    def broke_at(self, episode: Episode) -> int | None:
+        """The first opening in any of them."""
+        steps = [step for _, step in self._events(episode).values() if step is not None]
+        return min(steps, default=None)
 
     def _events(self, episode: Episode) -> dict[str, tuple[float, int | None]]:
         """Phase -> share of it before the opening, and the step of that."""

@@ -83,6 +83,17 @@ class Scorer(ABC):
         """
         return None
 
+    def broke_at(self, episode: Episode) -> int | None:
+        """Step at which something went wrong that was right until then, and nobody doubts why.
+
+        What was before it is a good demonstration of the beginning of the task. None: nothing
+        broke, or the cause may lie further back.
+
+        Raises:
+            Abstain: as `score` does.
+        """
+        return None
+
     def check_params(self) -> None:
         """Check the hyper-parameters; not done on construction, as scikit-learn has it.
 

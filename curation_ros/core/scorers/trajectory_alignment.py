@@ -133,7 +133,8 @@ class LabelFreeTrajectoryAlignment(PoolScorer):
         if self.of == "time-mean":
             return np.asarray(states.mean(axis=0))
         steps = np.rint(np.linspace(0, len(states) - 1, self.n_points)).astype(np.int64)
-        return states[steps].ravel()
+        resampled: Floats = states[steps].ravel()
+        return resampled
 
     def _learn(self, features: Floats, fold: npt.NDArray[np.int64]) -> None:
         self.mean_ = np.array(

@@ -70,7 +70,8 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], int]:
     [
         (ConfigError("key 'x'"), USAGE, "error: key 'x'"),
         (BagError("bag y"), NOTHING, "error: bag y"),
-        (ImportError("no torch", name="torch"), USAGE, "error: fail needs torch"),
+        (ModuleNotFoundError("no torch", name="torch"), USAGE, "error: fail needs torch"),
+        (ImportError("NumPy 2 is needed\nby x", name="x"), USAGE, "error: fail: NumPy 2 is"),
         (KeyboardInterrupt(), INTERRUPTED, "error: interrupted"),
         (RuntimeError("why?"), FAULT, "error: a fault of ours: RuntimeError: why?"),
     ],

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import getpass
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,21 @@ def test_user_of_the_machine_decides_where_nobody_is_named(curation: Run, folder
     assert decision.by == getpass.getuser()
 
 
+def test_person_may_keep_the_beginning_and_later_all_of_it(curation: Run, folder: Path) -> None:
+    data = folder / "data"
+    told = curation("override", data, "pick-2", "salvage", "--until", 4.15, "--by", "Ada")
+    assert told.code == DONE
+    assert told.out.startswith("salvage pick-2 (revision 1): Ada decided; kept until 4.15 s of ")
+    [row] = curation("select", data, "--json").rows
+    [entry] = json.loads(Path(row["manifest"]).read_text())["entries"]
+    assert (entry["name"], entry["span"]) == ("pick-2", [0, 4_150_000_000])
+    [row] = curation("override", data, "pick-2", "keep", "--json").rows
+    assert (row["revision"], row["span"]) == (2, [0, 11_960_000_000])
+    [row] = curation("select", data, "--json").rows
+    [entry] = json.loads(Path(row["manifest"]).read_text())["entries"]
+    assert entry["span"] is None
+
+
 def test_beginning_of_an_id_is_enough(curation: Run, folder: Path) -> None:
     dataset = Dataset(folder / "data")
     episode_id = dataset.find("pick-3")
@@ -47,7 +63,12 @@ def test_beginning_of_an_id_is_enough(curation: Run, folder: Path) -> None:
     [
         (["nobody", "keep"], NOTHING, "no episode has the id or name 'nobody'; 5 are known"),
         (["", "keep"], NOTHING, "no episode has the id or name ''"),
-        (["pick-0", "salvage"], USAGE, "salvage"),
+        (["pick-0", "salvage"], USAGE, "salvage needs --until SECONDS"),
+        (["pick-0", "keep", "--until", "3"], USAGE, "--until belongs to salvage"),
+        (["pick-0", "salvage", "--until", "soon"], USAGE, "soon"),
+        (["pick-0", "salvage", "--until", "nan"], NOTHING, "until nan s: expected from 1 s"),
+        (["pick-0", "salvage", "--until", "0.5"], NOTHING, "expected from 1 s to less than 11.96"),
+        (["pick-0", "salvage", "--until", "11.96"], NOTHING, "11.96 s, which is all of it"),
         (["pick-0"], USAGE, "verdict"),
         (["pick-0", "keep", "--by", "curator"], NOTHING, "is no person"),
     ],

@@ -35,8 +35,9 @@ def test_the_report_is_written_where_it_is_asked_for(
     assert "outcomes are missing; the report says which" in answer.out
 
 
-def test_the_report_is_written_beside_the_results(curation: Run, results: Path) -> None:
-    answer = curation("report", results, "--json")
+@pytest.mark.parametrize("of", ["folder", "file"])
+def test_the_report_is_written_beside_the_results(curation: Run, results: Path, of: str) -> None:
+    answer = curation("report", results if of == "file" else results.parent, "--json")
     assert answer.code == DONE
     [row] = answer.rows
     assert row["report"] == str(results.parent / "report.html")

@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -90,7 +91,10 @@ def test_table_is_for_people(curation: Run, folder: Path) -> None:
     for name in VERDICTS:
         assert name in told.out
     assert "{" not in told.out
-    assert "rule threshold: keep where gripper_timing >=" in " ".join(told.err.split())
+    rule = "rule evidence: the first that can tell: object_coupling, then grip_consistency"
+    said = " ".join(told.err.split())
+    assert rule in said
+    assert "then keep where gripper_timing >=" in said
 
 
 @pytest.mark.parametrize("kind", ["dataset", "bag", "file", "folder", "mixed"])
@@ -141,17 +145,29 @@ def test_scorers_may_be_chosen_and_the_one_that_decides_is_added(
         "score", _bag(folder), *_options(folder), "--scorers", "length, smoothness", "--json"
     )
     assert told.code == DONE
-    assert list(told.rows[0]["scores"]) == ["length", "smoothness", "gripper_timing"]
+    decide = ["object_coupling", "grip_consistency", "phase_events", "gripper_timing"]
+    assert list(told.rows[0]["scores"]) == ["length", "smoothness", *decide]
     assert told.rows[0]["decision"] == "keep"
     alone = curation("score", _bag(folder), "--scorers", "length", "--rule", "none", "--json")
     assert alone.rows[0]["scores"] == {"length": -240.0}
     assert alone.rows[0]["decision"] == "review"
 
 
+@pytest.mark.parametrize("rule", ["threshold", "evidence"])
+def test_value_is_what_the_rule_takes(curation: Run, folder: Path, rule: str) -> None:
+    for value, verdict in (("0.99", "discard"), ("0.5", "keep")):
+        options = ["--scorers", "gripper_timing", "--rule", rule, "--value", value, "--json"]
+        told = curation("score", _bag(folder), *options)
+        assert told.code == DONE
+        decided = verdict if rule == "threshold" else "keep"  # the object has the first word
+        assert told.rows[0]["decision"] == decided
+
+
 def test_shipped_config_scores_without_a_reference(curation: Run, folder: Path) -> None:
     [row] = curation("score", _bag(folder), "--json").rows
     assert list(row["scores"]) == list(DEFAULT_SCORERS)
-    assert row["decision"] == "review"
+    assert (row["decision"], row["span"][0]) == ("keep", 0)
+    assert row["reason"].startswith("object_coupling: what was grasped stayed with the effector")
 
 
 # --- files that cannot be read ------------------------------------------------------------------
@@ -246,6 +262,8 @@ def test_check_tells_findings_by_the_exit_code(curation: Run, folder: Path) -> N
         (["--scorers", "nose"], USAGE, "no scorer 'nose'"),
         (["--scorers", "length,,knn"], USAGE, "no scorer ''"),
         (["--rule", "nose"], USAGE, "no rule 'nose'"),
+        (["--rule", "nose", "--value", "1"], USAGE, "no rule 'nose'"),
+        (["--rule", "none", "--value", "1"], USAGE, "no parameter 'value'"),
         (["--reference", "empty"], NOTHING, "empty"),
         (["--reference", "none"], NOTHING, "none"),
         (["--reference", "bad.yaml"], NOTHING, "bad.yaml"),
@@ -301,6 +319,24 @@ def test_written_decisions_are_those_that_were_printed(curation: Run, folder: Pa
     assert all(len(Dataset(folder / "data").decisions(i)) == 1 for i in decided)
 
 
+def test_verdicts_that_are_replaced_are_counted(curation: Run, folder: Path) -> None:
+    data = folder / "data"
+    person = curation("override", data, "pick-0", "discard", "--by", "Ada", "--json")
+    assert person.code == DONE
+    first = curation("score", data, *_options(folder), "--write", "--json")
+    assert "replaced" not in first.err
+    before = {row["episode"]: row["decision"] for row in first.rows}
+    other = ["--rule", "top-k", "--rule-scorer", "length", "--value", "1", "--write", "--json"]
+    told = curation("score", data, *other)
+    changed = [(before[r["episode"]], r["decision"]) for r in told.rows]
+    counts = Counter((old, new) for old, new in changed if old != new)
+    assert counts
+    [line] = [line for line in told.err.splitlines() if "replaced" in line]
+    for (old, new), n in counts.items():
+        assert f"{n} from {old} to {new}" in line
+    assert "replaced" not in curation("score", data, *other).err
+
+
 def test_nothing_is_written_without_being_asked(curation: Run, folder: Path) -> None:
     before = sorted(p for p in folder.rglob("*"))
     curation("score", folder / "data", *_options(folder), "--json")
@@ -323,6 +359,21 @@ def test_decision_of_a_person_stays_in_force_beside_new_scores(
         assert row["scores"]["gripper_timing"] == 1.0  # closed as long as it is looked at
     else:
         assert "Ada decided" in told.out
+
+
+def test_part_that_is_kept_of_a_salvage_is_shown_to_people(curation: Run, folder: Path) -> None:
+    early = _bag(folder, "pick-2")
+    told = curation("score", early, "--json")
+    [row] = told.rows
+    whole_ns = 10_000_000 + 239 * 50_000_000  # the first step is 10 ms after the start
+    assert row["decision"] == "salvage"
+    assert row["span"][0] <= 10_000_000 < row["span"][1] < whole_ns
+    shown = curation("score", early).out
+    assert "from" not in shown
+    assert f"until {row['span'][1] / 1e9:.2f} s" in shown
+    assert f"of {whole_ns / 1e9:.2f} s" in shown
+    assert "object coupling" in shown
+    assert "of 11.96 s" not in curation("score", _bag(folder, "pick-0")).out
 
 
 def test_write_takes_one_dataset(curation: Run, folder: Path) -> None:

@@ -2,11 +2,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from streams import record, short_episode
 
+from curation_ros.core.decisions import Decision
 from curation_ros.core.selection import KEEP_RULES
 from curation_ros.dataset import Dataset
 
@@ -31,8 +35,11 @@ def test_selection_is_written_and_told(curation: Run, data: Path) -> None:
     told = curation("select", data, "--json")
     assert told.code == DONE
     [row] = told.rows
-    assert list(row) == ["manifest", "kept", "of"]
-    assert (row["kept"], row["of"]) == (2, 5)
+    assert list(row) == ["manifest", "kept", "of", "rule", "phases", "warnings"]
+    assert (row["kept"], row["of"], row["rule"]) == (2, 5, "decisions")
+    assert row["phases"] == json.loads(Path(row["manifest"]).read_text())["phases"]
+    assert row["phases"]["shown"]["RELEASE"]["demonstrations"] == 2
+    assert row["warnings"] == []
     assert Path(row["manifest"]).parent == data / "selections"
     assert sorted(_names(row["manifest"])) == ["pick-0", "pick-1"]
 
@@ -52,7 +59,7 @@ def test_every_rule_can_be_asked_for(curation: Run, data: Path) -> None:
         options = ["--scorer", "gripper_timing", "--value", values[rule]] if rule in values else []
         if rule == "gap":
             told = curation("select", data, "--rule", rule, "--scorer", "gripper_timing")
-            assert told.code == 2
+            assert told.code == NOTHING
             assert "no two groups" in told.err
             assert "5 scores are too few" in told.err
             continue
@@ -60,6 +67,53 @@ def test_every_rule_can_be_asked_for(curation: Run, data: Path) -> None:
         assert told.code == DONE, told.err
         expected = {"decisions": 2, "all": 5, "top-k": 3, "top-fraction": 2, "threshold": 3}
         assert told.rows[0]["kept"] == expected[rule]
+
+
+def test_scorer_without_a_rule_that_does_not_separate_selects_nothing(
+    curation: Run, data: Path
+) -> None:
+    told = curation("select", data, "--scorer", "gripper_timing", "--json")
+    assert (told.code, told.out) == (NOTHING, "")
+    assert "keep rule 'gap': no two groups to choose from: 5 scores are too few" in told.err
+    assert (
+        "nothing is selected: have a person review the episodes, or choose by another" in told.err
+    )
+    assert not (data / "selections").exists()
+
+
+def test_scorer_without_a_rule_keeps_the_upper_group(curation: Run, data: Path) -> None:
+    dataset = Dataset(data)
+    rng = np.random.default_rng(1)
+    for k in range(7):
+        episode = short_episode(rng, name=f"more-{k}")
+        record(dataset, episode)
+        dataset.append_decision(
+            Decision(episode.id, episode.name, "review", "r", (0, 1), {"gripper_timing": 0.1})
+        )
+    told = curation("select", data, "--scorer", "gripper_timing", "--json")
+    assert told.code == DONE, told.err
+    assert told.rows[0]["rule"] == "gap"
+    assert not any(name.startswith("more") for name in _names(told.rows[0]["manifest"]))
+
+
+def test_phase_that_few_show_is_a_warning(curation: Run, data: Path) -> None:
+    dataset = Dataset(data)
+    for name in ("pick-0", "pick-1"):
+        episode_id = dataset.find(name)
+        decision = dataset.latest_decisions()[episode_id]
+        cut = replace(decision, verdict="salvage", span=(0, 6_500_000_000))
+        dataset.append_decision(cut)
+    said = "is shown by 0 of 2 demonstrations kept: a policy sees little of it"
+    [row] = curation("select", data, "--json").rows
+    assert [line.split()[0] for line in row["warnings"]] == ["TRANSPORT", "RELEASE"]
+    assert all(said in line for line in row["warnings"])
+    assert row["phases"]["shown"]["TRANSPORT"] == {"demonstrations": 0, "steps": 0}
+    told = curation("select", data)
+    assert "kept 2 of 5, 2 of them in part: " in told.out
+    assert "phases shown by 2 demonstrations: PREGRASP 2" in told.out
+    assert f"warning: RELEASE {said}" in told.err
+    told = curation("select", data, "--rule", "all")
+    assert "2 of these are decided to be kept in part: here they are whole" in told.out
 
 
 def test_seed_orders_equal_scores(curation: Run, data: Path) -> None:

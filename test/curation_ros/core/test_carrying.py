@@ -23,6 +23,7 @@ from scenes import (
 
 from curation_ros.core.carrying import Carrying, CarryWatch, Hold, carrying_of
 from curation_ros.core.episode import Episode
+from curation_ros.core.gripper import commanded
 
 N_CARRY = RELEASE_AT - LIFT_AT
 TREMOR_M = 1e-5
@@ -79,6 +80,7 @@ def test_drop_in_lift_is_noticed_in_the_third_step() -> None:
 def test_drop_with_the_gripper_closed_is_a_drop() -> None:
     hold = only_hold(scene(dropped_at=TRANSPORT_AT + 20))
     assert (hold.state, hold.phase, hold.opened) == ("broken", "TRANSPORT", False)
+    assert (hold.departed, hold.noticed) == (TRANSPORT_AT + 21, TRANSPORT_AT + 22)
 
 
 def test_object_that_was_left_behind_was_never_carried() -> None:
@@ -186,7 +188,7 @@ def watched(episode: Episode, chunk: int) -> tuple[Carrying, int | None]:
     for stop in [*range(chunk, len(episode), chunk), len(episode)]:
         watch.take(episode.steps(stop))
         assert watch.n_steps == stop
-        if known is None and watch.lost is not None:
+        if known is None and watch.losses:
             known = stop - 1
     return watch.finish(), known
 
@@ -248,6 +250,19 @@ def test_one_wild_pose_is_no_drop() -> None:
         bowl = made.fields["bowl_position"].copy()
         bowl[LIFT_AT + 30] += [0.0, 0.0, -far_m]
         assert only_hold(with_fields(made, bowl_position=bowl)).state == "carried"
+
+
+def test_one_wild_pose_is_no_drop_after_the_gripper_had_opened_for_a_moment() -> None:
+    # 6 cm back up in one step is no motion either: then nobody knows.
+    for far_m, state in ((0.03, "carried"), (0.06, "unknown"), (0.3, "carried")):
+        made = scene(tremor_m=TREMOR_M)
+        command = made.fields["gripper"].copy()
+        command[LIFT_AT + 20] = command[0]
+        bowl = made.fields["bowl_position"].copy()
+        bowl[LIFT_AT + 30] += [0.0, 0.0, -far_m]
+        fumbled = with_fields(made, bowl_position=bowl, gripper=command)
+        assert (commanded(fumbled)[[LIFT_AT + 20, LIFT_AT + 21]] > 0).tolist() == [True, False]
+        assert only_hold(fumbled).state == state
 
 
 def test_missing_values_are_no_samples() -> None:

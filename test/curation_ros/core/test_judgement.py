@@ -26,7 +26,10 @@ def test_decision_covers_the_whole_episode_and_carries_what_it_was_given() -> No
     assert (got.verdict, got.span) == ("keep", (0, 90))
     assert (got.episode, got.name, got.revision, got.by) == ("e", "pick-1", 3, "curator")
     assert (got.scores, got.abstained) == ({"s": 1.0, "t": None}, {"t": "why"})
-    assert (got.evidence, got.state_hash) == ({"x": [1, 2], "y": 3}, "abc")
+    assert (got.evidence, got.state_hash) == (
+        {"x": [1, 2], "y": 3, "decided_by": "s"},
+        "abc",
+    )
 
 
 def test_without_a_rule_it_is_review_no_reference() -> None:

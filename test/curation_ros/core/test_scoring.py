@@ -37,10 +37,10 @@ def curation(reference: list[Episode]) -> Curation:
 
 
 def test_early_release_is_discarded_with_time_and_phase(
-    curation: Curation, rng: np.random.Generator
+    reference: list[Episode], rng: np.random.Generator
 ) -> None:
     early = make_episode(rng, 500, task_steps=240, open_at=140)
-    decision = curation.decide(early)
+    decision = Curation(rule="threshold").fit(reference).decide(early)
     assert decision.verdict == "discard"
     assert decision.reason == (
         "the gripper opened at 7.0 s, in LIFT; clean demonstrations open at 11.6 s or later"
@@ -54,12 +54,13 @@ def test_early_release_is_discarded_with_time_and_phase(
 
 
 @pytest.mark.parametrize("n_steps", [225, 234, 240, 255])
+@pytest.mark.parametrize("rule", ["threshold", "evidence"])
 def test_good_episodes_of_other_lengths_are_kept(
-    curation: Curation, rng: np.random.Generator, n_steps: int
+    reference: list[Episode], rng: np.random.Generator, n_steps: int, rule: str
 ) -> None:
-    decision = curation.decide(make_episode(rng, n_steps))
+    decision = Curation(rule=rule).fit(reference).decide(make_episode(rng, n_steps))
     assert decision.verdict == "keep", decision.reason
-    assert "fitted on 6 references" in decision.reason
+    assert ("fitted on 6 references" in decision.reason) == (rule == "threshold")
 
 
 def test_references_themselves_are_kept(curation: Curation, reference: list[Episode]) -> None:
@@ -70,7 +71,7 @@ def test_references_themselves_are_kept(curation: Curation, reference: list[Epis
 def test_any_scorer_may_decide(
     rule_scorer: str, reference: list[Episode], rng: np.random.Generator
 ) -> None:
-    curation = Curation(rule_scorer=rule_scorer).fit(reference)
+    curation = Curation(rule="threshold", rule_scorer=rule_scorer).fit(reference)
     decision = curation.decide(make_episode(rng))
     assert decision.verdict in ("keep", "discard")
     assert np.isfinite(decision.evidence["threshold"])
@@ -96,14 +97,13 @@ def test_length_is_scored_whole_and_the_others_truncated(
     scores, abstained = curation.score(long)
     cut, _ = curation.score(long.steps(234))
     assert scores["length"] == -500
-    assert {k: v for k, v in scores.items() if k != "length"} == {
-        k: v for k, v in cut.items() if k != "length"
-    }
+    truncated = [k for k in scores if SCORERS[k].length_controlled]
+    assert {k: scores[k] for k in truncated} == {k: cut[k] for k in truncated}
     assert abstained == {}
 
 
 def test_no_reference_leaves_everything_for_review(rng: np.random.Generator) -> None:
-    curation = Curation().fit([])
+    curation = Curation(rule="threshold").fit([])
     decision = curation.decide(make_episode(rng, open_at=140))
     assert (decision.verdict, decision.reason) == ("review", "no reference")
     needing = {k for k in DEFAULT_SCORERS if SCORERS[k].needs == "reference"}
@@ -113,13 +113,13 @@ def test_no_reference_leaves_everything_for_review(rng: np.random.Generator) -> 
 
 
 def test_given_threshold_decides_without_reference(rng: np.random.Generator) -> None:
-    curation = Curation(rule_params={"threshold": 0.9}).fit([])
+    curation = Curation(rule="threshold", rule_params={"threshold": 0.9}).fit([])
     assert curation.decide(make_episode(rng, open_at=140)).verdict == "discard"
     assert curation.decide(make_episode(rng)).verdict == "keep"
 
 
 def test_two_references_are_too_few(reference: list[Episode], rng: np.random.Generator) -> None:
-    decision = Curation().fit(reference[:2]).decide(make_episode(rng))
+    decision = Curation(rule="threshold").fit(reference[:2]).decide(make_episode(rng))
     assert decision.verdict == "review"
     assert decision.reason == "the rule needs 3 reference episodes, there are 2"
 
@@ -161,6 +161,146 @@ def test_decision_ignores_where_in_time_the_episode_lies(
 ) -> None:
     episode = make_episode(rng, open_at=140)
     assert curation.decide(shifted(episode, 10**15)) == curation.decide(copied(episode))
+
+
+# --- the default: the first evidence that can tell ----------------------------------------------
+
+OBJECTS = ("bowl_position", "plate_position")
+
+
+def without(episode: Episode, *fields: str) -> Episode:
+    """The same episode of a graph that has none of these."""
+    kept = {k: v for k, v in episode.topic_map.fields.items() if k not in fields}
+    gripper = episode.topic_map.gripper
+    if gripper is not None and gripper.fingers in fields:
+        gripper = replace(gripper, fingers="")
+    state = tuple(part for part in episode.topic_map.state if part.split("[")[0] not in fields)
+    topic_map = replace(episode.topic_map, fields=kept, state=state, gripper=gripper)
+    values = {k: v for k, v in episode.fields.items() if k not in fields}
+    return replace(episode, topic_map=topic_map, fields=values)
+
+
+def test_drop_is_salvaged_up_to_a_margin_before_the_command_to_open(
+    rng: np.random.Generator,
+) -> None:
+    early = make_episode(rng, 500, task_steps=240, open_at=140)
+    decision = Curation().fit([]).decide(early)
+    last = int(early.stamps_ns[140 - 15]) - early.start_ns
+    assert decision.verdict == "salvage"
+    assert decision.span == (int(early.stamps_ns[0]) - early.start_ns, last)
+    assert decision.evidence["decided_by"] == "object_coupling"
+    assert decision.evidence["salvage"] == {
+        "scorer": "object_coupling",
+        "broke_ns": int(early.stamps_ns[140]) - early.start_ns,
+        "margin_s": 0.75,
+    }
+    assert decision.reason.endswith("; kept until 6.26 s")
+    assert Decision.from_line(decision.to_line()) == decision
+
+
+@pytest.mark.parametrize(("margin_s", "last"), [(0.0, 139), (0.5, 130), (0.51, 129), (1.5, 110)])
+def test_margin_is_kept_to_the_step(rng: np.random.Generator, margin_s: float, last: int) -> None:
+    early = make_episode(rng, open_at=140)
+    decision = Curation(salvage_margin_s=margin_s).fit([]).decide(early)
+    assert decision.span[1] == int(early.stamps_ns[last]) - early.start_ns
+
+
+def test_without_a_margin_or_a_beginning_it_is_discarded(rng: np.random.Generator) -> None:
+    early = make_episode(rng, open_at=140)
+    whole = (0, early.end_ns - early.start_ns)
+    never = Curation(salvage_margin_s=None).fit([]).decide(early)
+    assert (never.verdict, never.span) == ("discard", whole)
+    assert "salvage" not in never.evidence
+    nothing = Curation(salvage_margin_s=6.5).fit([]).decide(early)
+    assert (nothing.verdict, nothing.span) == ("discard", whole)
+    assert nothing.reason.endswith("; too little was good before that")
+
+
+@pytest.mark.parametrize(
+    ("missing", "decides"),
+    [
+        ((), "object_coupling"),
+        (OBJECTS, "grip_consistency"),
+        ((*OBJECTS, "finger_position"), "phase_events"),
+        ((*OBJECTS, "finger_position", "phase"), "gripper_timing"),
+        (("phase",), "gripper_timing"),
+    ],
+)
+def test_weaker_evidence_decides_where_the_stronger_is_missing(
+    reference: list[Episode],
+    rng: np.random.Generator,
+    missing: tuple[str, ...],
+    decides: str,
+) -> None:
+    good, early = make_episode(rng), make_episode(rng, open_at=140)
+    curation = Curation().fit([without(e, *missing) for e in reference])
+    kept, dropped = (curation.decide(without(e, *missing)) for e in (good, early))
+    assert kept.verdict == "keep"
+    assert dropped.verdict == ("discard" if decides == "gripper_timing" else "salvage")
+    assert {kept.evidence["decided_by"], dropped.evidence["decided_by"]} == {decides}
+    assert ("threshold" in kept.evidence) == (decides == "gripper_timing")
+    silent = [n for n in RULES["evidence"].consults if n in kept.abstained]
+    for name in silent if decides == "gripper_timing" else []:
+        assert f"{name} cannot tell: {kept.abstained[name]}" in kept.reason
+    assert ("object_coupling cannot tell" in kept.reason) == (decides != "object_coupling")
+
+
+def test_nothing_to_go_by_is_review(rng: np.random.Generator) -> None:
+    blind = without(make_episode(rng), *OBJECTS, "finger_position", "phase")
+    decision = Curation().fit([]).decide(blind)
+    assert decision.verdict == "review"
+    assert decision.reason.startswith("object_coupling cannot tell: the topic map declares no")
+    assert decision.reason.endswith("; no reference")
+
+
+def test_law_that_most_of_the_reference_breaks_is_none(
+    reference: list[Episode], rng: np.random.Generator
+) -> None:
+    """A graph on which the object's pose means something else, say the frame of its shelf."""
+
+    def shelved(episode: Episode) -> Episode:
+        still = np.tile(episode.fields["bowl_position"][:1], (len(episode), 1))
+        still[:, 0] += 1e-4 * np.sin(np.arange(len(episode)))  # it is seen, and lies there
+        return replace(episode, fields={**episode.fields, "bowl_position": still})
+
+    for params in ({}, {"threshold": 0.5}):
+        curation = Curation(rule_params=params).fit([shelved(e) for e in reference])
+        decision = curation.decide(shelved(make_episode(rng)))
+        decided_by = decision.evidence["decided_by"]
+        assert (decision.verdict, decided_by) == ("keep", "grip_consistency")
+    assert decision.reason.endswith(
+        "; object_coupling is no law here: most of the reference breaks it"
+    )
+    one_bad = [shelved(reference[0]), *reference[1:]]
+    kept = Curation().fit(one_bad).decide(make_episode(rng))
+    assert kept.evidence["decided_by"] == "object_coupling"
+    doubted = Curation().fit([]).decide(shelved(make_episode(rng)))
+    assert doubted.verdict == "review"
+    assert "; but grip_consistency: the fingers held" in doubted.reason
+    unseen = Curation().fit([]).decide(without(shelved(make_episode(rng)), "finger_position"))
+    assert unseen.verdict == "discard"
+
+
+def test_hold_whose_end_has_no_known_phase_is_not_known(rng: np.random.Generator) -> None:
+    episode = make_episode(rng)
+    phase = episode.fields["phase"].copy()
+    phase[130:] = np.nan
+    cut = replace(episode, fields={**episode.fields, "phase": phase})
+    decision = Curation().fit([]).decide(cut)
+    assert decision.verdict == "review"
+    assert {"object_coupling", "grip_consistency", "phase_events"} <= set(decision.abstained)
+
+
+def test_one_that_saw_it_break_outweighs_one_of_its_kind_that_did_not(
+    rng: np.random.Generator,
+) -> None:
+    early = make_episode(rng, open_at=140)
+    stuck = early.fields["finger_position"].copy()
+    stuck[120:] = stuck[120]  # the fingers' topic repeats itself: they seem to hold on
+    frozen = replace(early, fields={**early.fields, "finger_position": stuck})
+    decision = Curation().fit([]).decide(without(frozen, *OBJECTS))
+    assert decision.evidence["decided_by"] == "phase_events"
+    assert decision.verdict == "salvage"
 
 
 # --- state hash ---------------------------------------------------------------------------------
@@ -264,6 +404,27 @@ def test_reference_that_the_deciding_scorer_cannot_score_is_refused_by_name(
         Curation().fit([*reference, never])
     fitted = Curation(rule_scorer="knn").fit([*reference, never])
     assert fitted.decide(make_episode(rng)).verdict in ("keep", "discard")
+
+
+def test_reference_that_shows_no_gripper_leaves_the_stronger_evidence(
+    reference: list[Episode], rng: np.random.Generator
+) -> None:
+    """A robot with a suction cup: no threshold on gripper timing, and none is needed."""
+
+    def cup(episode: Episode) -> Episode:
+        bare = without(episode, "gripper", "finger_position")
+        return replace(bare, topic_map=replace(bare.topic_map, gripper=None, action=("twist",)))
+
+    trusted = [cup(e) for e in reference]
+    curation = Curation().fit(trusted)
+    kept = curation.decide(cup(make_episode(rng)))
+    assert (kept.verdict, kept.evidence["decided_by"]) == ("keep", "object_coupling")
+    blind = without(cup(make_episode(rng)), *OBJECTS)
+    told = curation.decide(blind)
+    assert told.verdict == "review"
+    assert "gripper_timing cannot score it: the topic map declares no gripper" in told.reason
+    with pytest.raises(EpisodeError, match="gripper_timing cannot score it"):
+        Curation(rule="threshold").fit(trusted)
 
 
 def test_scorer_that_cannot_be_fitted_abstains_and_the_others_score(

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from curation_ros.core.balance import Balance, Shown
 from curation_ros.core.decisions import CURATOR, Decision, Verdict
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.selection import (
@@ -227,6 +228,17 @@ def test_manifest_survives_json() -> None:
     assert Manifest.from_json(json.loads(text)) == manifest()
     assert json.loads(text)["entries"][1] == {"episode": "b", "name": "n2", "span": [0, 5]}
     assert Manifest.from_json({**manifest().to_json(), "later": 1}) == manifest()
+
+
+def test_manifest_keeps_the_phases_and_reads_those_of_before() -> None:
+    counted = manifest(phases=Balance(2, 2, {"LIFT": Shown(2, 90), "RELEASE": Shown(1, 3)}))
+    raw = json.loads(json.dumps(counted.to_json()))
+    assert raw["phases"]["shown"]["RELEASE"] == {"demonstrations": 1, "steps": 3}
+    assert Manifest.from_json(raw) == counted
+    assert "phases" not in manifest().to_json()
+    assert manifest().phases is None
+    with pytest.raises(ConfigError, match="phases"):
+        Manifest.from_json({**raw, "phases": {"shown": 3}})
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
+import yaml
+from episodes import topic_map
 from graph import DiagnosticArray
-from robot import Robot, libero_take
+from robot import BOWL, PLATE, Robot, libero_take, without
 
 from curation_ros.core.status import Status
 from curation_ros.dataset import Dataset
@@ -13,9 +17,26 @@ from curation_ros.nodes.qos import EVENTS
 
 pytestmark = pytest.mark.ros
 
+#: A graph that does not publish objects.
+NO_OBJECT = replace(
+    topic_map(),
+    fields={name: spec for name, spec in topic_map().fields.items() if spec.role != "object"},
+    state=(),
+)
 
-def test_a_lost_object_is_told_with_its_phase_and_time(graph):
-    dataset = graph.folder / "dataset"
+
+def no_object(take):
+    return without(without(take, BOWL), PLATE)
+
+
+@pytest.mark.parametrize(
+    ("objects", "found_by"), [(True, "object-lost"), (False, "grip-lost")], ids=str
+)
+def test_a_loss_is_told_with_its_phase_and_time(graph, objects, found_by):
+    dataset = graph.folder / f"dataset-{found_by}"
+    map_ = topic_map() if objects else NO_OBJECT
+    path = graph.folder / f"{found_by}.yaml"
+    path.write_text(yaml.safe_dump(map_.to_json()))
     alerts: list[tuple[int, Status]] = []
 
     def hear(message: DiagnosticArray) -> None:
@@ -23,25 +44,29 @@ def test_a_lost_object_is_told_with_its_phase_and_time(graph):
         alerts.append((stamp.sec * 10**9 + stamp.nanosec, single_from_ros(message)))
 
     heard = graph.node.create_subscription(DiagnosticArray, "curator/alert", hear, EVENTS)
-    graph.start("curator", dataset=dataset)
-    graph.ready("curator")
+    graph.start("curator", found_by, dataset=dataset, topic_map=path)
+    graph.ready(found_by)
     graph.until(lambda: graph.node.count_publishers("curator/alert"), "the curator can alert")
-    with Robot(graph) as robot:
+    with Robot(graph, map_, name=f"robot_{len(found_by)}") as robot:
         robot.until_heard(1)
-        clean = robot.play(libero_take(1))
+        clean, early = libero_take(1), libero_take(2, open_at=70)
+        if not objects:
+            clean, early = no_object(clean), no_object(early)
+        robot.play(clean)
         graph.decided(clean.id)
         assert alerts == []
-        early = robot.play(libero_take(2, open_at=70))
+        robot.play(early)
         graph.decided(early.id)
     graph.until(lambda: alerts, "the alert")
     [(stamp_ns, status)] = alerts
     assert (status.hardware_id, status.name) == (early.id, early.name)
-    assert (status.level, status.message) == (2, "object-lost")
+    assert (status.level, status.message) == (2, found_by)
     assert "in LIFT" in status.values["reason"]
     span = (int(status.values["span_start"]), int(status.values["span_end"]))
     assert 0 < stamp_ns - (early.started.start_ns + span[0]) <= 0.3e9
     [decision] = Dataset(dataset).decisions(early.id)
-    [found] = [f for f in decision.findings if f.id == "object-lost"]
+    [found] = [f for f in decision.findings if f.id == found_by]
     assert (found.message, found.span) == (status.values["reason"], span)
-    assert "object-lost" in graph.log("curator")
+    assert found_by in graph.log(found_by)
     graph.node.destroy_subscription(heard)
+    graph.stop(found_by)

@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import contextlib
 import io
+import shutil
 import struct
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from graph import jsonl
+from graph import Graph, jsonl
 from naive_resampling import resample
 from robot import Robot
 
@@ -40,8 +44,9 @@ RATES_HZ = {TOOL: 100.0, JOINTS: 250.0, WIDTH: 30.0, SERVO: 100.0, HAND: 30.0}
 EPISODE_S, AFTER_S, CLOSE_S, OPEN_S = 2.5, 0.3, 0.7, 2.2
 #: Of a period: how far stamps are off their grid. And of messages: how many come late.
 JITTER, LATE_SHARE, LATE_S = 0.35, 0.1, 0.03
-#: Longer than a busy machine keeps the robot from sending.
-MAX_GAP_S = 1.0
+#: Longer than a busy machine keeps the robot from sending; one that does for longer than the
+#: other plays again, so many takes in all, of which the last counts.
+MAX_GAP_S, MOST_LATE_S, MOST_TAKES = 1.0, 0.15, 4
 #: The curator's patience with what is withheld, and what the middleware needs to send again.
 SHORT_S, LONG_S = 0.5, 20.0
 MAP = {
@@ -203,8 +208,26 @@ def to_message(one: Sending, start_ns: int) -> Any:
     return std_msgs.Float64(data=v[0])
 
 
-def play(robot: Robot, one: Performance) -> Performance:
-    """Run an episode in real time; its owner says at once when it begins, and when it is over."""
+def play(
+    graph: Graph, robot: Robot, make: Callable[[], Performance], dataset: Path
+) -> Performance:
+    """Run an episode in real time, anew where a busy machine kept the robot from sending.
+
+    What has no header is stamped when it is sent: one that was sent late is another episode.
+    """
+    for last in (*[False] * (MOST_TAKES - 1), True):
+        one = make()
+        late_s = play_once(robot, one)
+        if last or late_s <= MOST_LATE_S:
+            break
+        assert graph.recorded(one.id).message.startswith("closed ")
+        shutil.rmtree(dataset / "episodes" / one.id)
+    return one
+
+
+def play_once(robot: Robot, one: Performance) -> float:
+    """Its owner says at once when it begins and ends; how late it sent what is stamped then, s."""
+    late_ns = 0
     start_ns = time.time_ns()
     started = EpisodeEvent(new_episode_id(), one.name, "started", start_ns)
     end_ns = start_ns + int(EPISODE_S * NS_PER_S)
@@ -212,9 +235,11 @@ def play(robot: Robot, one: Performance) -> Performance:
     robot.tell(started)
     for sending in one.sendings:
         time.sleep(max(0, start_ns + sending.due_ns - time.time_ns()) / NS_PER_S)
+        if sending.topic == WIDTH:
+            late_ns = max(late_ns, time.time_ns() - start_ns - sending.due_ns)
         robot.publishers[sending.topic].publish(to_message(sending, start_ns))
     robot.tell(one.event)
-    return one
+    return late_ns / NS_PER_S
 
 
 def send_withheld(robot: Robot, one: Performance) -> None:
@@ -261,7 +286,7 @@ def session(graph):
         graph.start("recorder", "reference", dataset=reference, topic_map=map_file)
         robot.until_heard()
         for k in range(3):
-            one = play(robot, perform(k, f"reference-{k}"))
+            one = play(graph, robot, partial(perform, k, f"reference-{k}"), reference)
             assert graph.recorded(one.id).message.startswith("closed ")
         graph.stop("reference")
         options = {"dataset": dataset, "topic_map": map_file}
@@ -269,7 +294,7 @@ def session(graph):
         graph.start("curator", "curator", reference=[reference], **options)
         robot.until_heard(2)
         for name, (make, _) in PERFORMANCES.items():
-            played[name] = play(robot, make())
+            played[name] = play(graph, robot, make, dataset)
             graph.settled(dataset, played[name].id)
             decided[name] = Dataset(dataset).decisions(played[name].id)
         graph.stop("curator")
@@ -277,7 +302,9 @@ def session(graph):
             "curator", "impatient", reference=[reference], drain_timeout_s=SHORT_S, **options
         )
         robot.until_heard(2)
-        one = played[LATE] = play(robot, withholding(perform(15, LATE), JOINTS, 0.4))
+        one = played[LATE] = play(
+            graph, robot, lambda: withholding(perform(15, LATE), JOINTS, 0.4), dataset
+        )
         graph.decided(one.id)  # its gate has closed; the recorder's waits
         send_withheld(robot, one)
         graph.settled(dataset, one.id)

@@ -114,6 +114,8 @@ def test_curate_returns_the_path_of_its_manifest(graph, dataset, takes):
     manifest = json.loads(path.read_text())
     assert [e["episode"] for e in manifest["entries"]] == [takes[3].id]
     assert manifest["kept_of"] == N_EPISODES
+    assert manifest["phases"]["shown"]["LIFT"] == {"demonstrations": 0, "steps": 0}
+    graph.ready("curator", line="LIFT is shown by 0 of 1 demonstrations kept")
 
 
 def test_restarted_curator_changes_no_decision(graph, dataset, takes):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import signal
+from dataclasses import replace
 
 import pytest
 from episodes import topic_map
@@ -143,3 +144,25 @@ def test_bag_of_a_stopped_recorder_outranks_what_went_on(graph, dataset):
             "the curator has closed the episode",
         )
     assert [d.evidence["bag"] for d in Dataset(dataset).decisions(take.id)] == ["alone"]
+
+
+def test_curator_that_is_stopped_in_mid_episode_waits_for_its_end(graph, dataset):
+    """Ctrl-C reaches everybody at once, and the owner needs a moment to say how it ended."""
+    take = libero_take(8)
+    aborted = replace(take.ended, event="aborted", counts={}, reason="aborted: the robot stopped")
+    with Robot(graph) as robot:
+        robot.until_heard(1)
+        robot.tell(take.started)
+        robot.send(take.messages[: take.until(0.5)])
+        graph.until(
+            lambda: [s for s in graph.health if s.name == "curator"][-1].hardware_id == take.id,
+            "the curator sees the episode",
+        )
+        graph.nodes.send("curator", signal.SIGINT)
+        graph.quiet(0.3)  # without the wait it would have gone by now
+        robot.tell(aborted)
+        code, log = graph.expect_exit("curator")
+    assert code == 0, log
+    [decision] = Dataset(dataset).decisions(take.id)
+    assert decision.verdict == "review"
+    assert decision.reason.startswith(aborted.reason)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import os
 import subprocess
 import sys
 
@@ -66,6 +68,7 @@ CASES = {
     "number_for_a_text": ("recorder", {"task": 5}, "parameter 'task': expected str"),
     "text_for_a_switch": ("recorder", {"auto": "maybe"}, "parameter 'auto': expected bool"),
     "dataset_is_a_file": ("recorder", {"dataset": "{}/a_file"}, "a_file"),
+    "dataset_empty": ("curator", {"dataset": ""}, "parameter 'dataset' is empty"),
     "nothing_to_replay": ("replay", {}, "parameter 'bags' is empty"),
     "replay_missing": ("replay", {"bags": ["{}/nowhere"]}, "nowhere: no such path"),
     "nobody_to_replay_to": (
@@ -111,7 +114,9 @@ def ended(graph: Graph):
     cases = []
     for name, (node, parameters, _) in CASES.items():
         given = {k: _in(folder, v) for k, v in parameters.items()}
-        arguments = node_arguments({"dataset": folder / "dataset", **given})
+        if node in ("curator", "recorder"):
+            given.setdefault("dataset", str(folder / "dataset"))
+        arguments = node_arguments(given)
         cases.append((name, NODE_MODULES[node], arguments))
     modules = sorted({module for _, module, _ in cases})
     done = subprocess.run(
@@ -145,5 +150,83 @@ def test_spoilt_ros_arguments_are_one_line_too():
     arguments = [sys.executable, "-m", NODE_MODULES["recorder"], "--ros-args", "-p", "dataset"]
     done = subprocess.run(arguments, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    # The first line is rcl's own.
-    assert [line[:22] for line in done.stderr.splitlines()[1:]] == ["error: ROS arguments: "]
+    assert [line[:22] for line in done.stderr.splitlines()] == ["error: ROS arguments: "]
+
+
+def _run(module, *arguments):
+    return subprocess.run(
+        [sys.executable, "-m", NODE_MODULES[module], *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+def test_stray_argument_is_refused():
+    done = _run("recorder", "--dataset=there")
+    assert done.returncode == 2
+    assert done.stderr == (
+        "error: unknown argument '--dataset=there': parameters follow --ros-args -p; "
+        "--help lists them\n"
+    )
+
+
+@pytest.mark.parametrize("node", ["recorder", "curator", "replay"])
+def test_help_lists_every_parameter(node):
+    done = _run(node, "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    table = importlib.import_module(NODE_MODULES[node]).PARAMETERS
+    lines = done.stdout.splitlines()
+    assert [line.split()[0] for line in lines[1:]] == [p.name for p in table]
+    assert all(p.description in line for p, line in zip(table, lines[1:], strict=True))
+
+
+def test_misspelt_parameter_is_named(graph):
+    graph.start("recorder", dataset=graph.folder / "right", datset=graph.folder / "wrong")
+    graph.ready(
+        "recorder",
+        line="there is no parameter 'datset': it changes nothing; is 'dataset' meant?",
+    )
+    graph.stop("recorder")
+    assert (graph.folder / "right").is_dir()
+
+
+# --- stopped while it starts ----------------------------------------------------------------
+
+#: A node that is sent SIGINT while it is imported, and one that is while it is made.
+STOPS_ITSELF = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nsignal.pause()\n"
+IMPORTED = """
+import sys
+from curation_ros import executables
+executables.NODE_MODULES = {"recorder": "module"}
+sys.exit(executables.recorder())
+"""
+MADE = """
+import importlib, sys
+from curation_ros.nodes.spinning import run
+sys.exit(run(lambda: importlib.import_module("module"), ()))
+"""
+
+
+def _starting(code, module, folder):
+    (folder / "module.py").write_text(module)
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": str(folder)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+@pytest.mark.parametrize("code", [IMPORTED, MADE])
+def test_node_stopped_while_it_starts_ends_at_once_and_quietly(code, tmp_path):
+    done = _starting(code, STOPS_ITSELF, tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_rclpy_that_does_not_load_is_named(tmp_path):
+    done = _starting(IMPORTED, "from json import dumbs\n", tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: recorder: cannot import name 'dumbs'")
+    assert done.stderr.count("\n") == 1

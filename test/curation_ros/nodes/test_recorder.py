@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import signal
+from collections import Counter
 from contextlib import suppress
 
 import pytest
+from mcap.records import Channel
 from mcap_ros2.reader import read_ros2_messages
 from robot import Robot, distinct, libero_take, plain, stamp_ns
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from curation_ros.bags.mcap_file import Message, TornFileError, walk
 from curation_ros.bags.reader import open_bag, read_episode
 from curation_ros.dataset import Dataset
 
@@ -22,6 +25,8 @@ KILLED = dict.fromkeys(("killed-0", "killed-1", "killed-2"), signal.SIGKILL)
 TOGETHER = ("first", "second")
 #: The contract: a kill costs less than this of the episode.
 MOST_LOST_S = 0.3
+#: Messages of a third of a second.
+LAST = 140
 
 
 class Sessions:
@@ -38,6 +43,18 @@ class Sessions:
     def bag(self, key):
         return self.dataset(key) / "episodes" / self.take.id
 
+    def written(self, key):
+        """Topic -> messages of the episode that are on disk, while it is recorded."""
+        found = list((self.dataset(key) / "episodes" / ".partial" / self.take.id).glob("*.mcap"))
+        topics, counts = {}, Counter()
+        with suppress(TornFileError):
+            for record in walk(found[0]) if found else ():
+                if isinstance(record, Channel):
+                    topics[record.id] = record.topic.lstrip("/")
+                elif isinstance(record, Message):
+                    counts[topics[record.channel_id]] += 1
+        return dict(counts)
+
     def record(self, robot):
         keys = (*TOGETHER, *SIGNALS, *KILLED)
         for key in keys:
@@ -51,10 +68,15 @@ class Sessions:
         # that they fall differently between two flushes.
         for k, (key, number) in enumerate({**KILLED, **SIGNALS}.items(), 1):
             upto = self.sent[key] = len(messages) * k // 10 + 13 * k
-            robot.send(messages[done:upto], rate_hz=RATE_HZ)
+            # A busy machine keeps a recorder waiting: what is killed has caught up just before.
+            caught_up = upto if key in SIGNALS else upto - LAST
+            robot.send(messages[done:caught_up], rate_hz=RATE_HZ)
+            self.graph.until(
+                lambda key=key, n=caught_up: self.written(key) == distinct(messages[:n]),
+                f"{key} has written everything",
+            )
+            robot.send(messages[caught_up:upto], rate_hz=RATE_HZ)
             done = upto
-            if key in SIGNALS:
-                self.graph.quiet(0.3)  # it has taken everything
             self.graph.nodes.send(key, number)
             if key in SIGNALS:
                 self.graph.until(self.bag(key).exists, f"the bag of {key}")

@@ -71,6 +71,31 @@ def test_best_effort_publisher_is_recorded(graph, small):
     assert offered["/eef_pose"] == "reliable"
 
 
+def test_stopped_recorder_takes_what_waits_for_it(graph, small):
+    """It was behind when it was told to stop."""
+    _, robot = small
+    dataset = graph.folder / "behind"
+    path = graph.folder / "small.yaml"
+    graph.start("recorder", "behind", dataset=dataset, topic_map=path)
+    robot.until_heard(2)
+    take = small_take(6, 120)
+    robot.tell(take.started)
+    graph.ready("behind", line=f"recording {take.name}")
+    robot.send(take.messages[:60], rate_hz=100.0)
+    graph.nodes.send("behind", signal.SIGSTOP)
+    try:
+        robot.send(take.messages[60:], rate_hz=100.0)
+        graph.nodes.send("behind", signal.SIGINT)
+    finally:
+        graph.nodes.send("behind", signal.SIGCONT)
+    assert graph.expect_exit("behind")[0] == 0
+    bag = open_bag(dataset / "episodes" / take.id)
+    assert bag.event().event == "aborted"
+    counts = bag_counts(bag)
+    assert counts["eef_pose"] == counts["joint_states"] == 120
+    robot.tell(take.ended)  # for the other recorder
+
+
 def test_lost_messages_are_counted(graph, small):
     """A recorder that is stopped for longer than its queues hold, and then goes on."""
     dataset, robot = small

@@ -1,0 +1,144 @@
+"""What the curator makes of a pool by itself, and how much of each phase a training set shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from curation_ros.core.balance import balance_of, phase_steps
+from curation_ros.core.decisions import VERDICTS, Decision
+from curation_ros.core.episode import Episode
+from curation_ros.core.examination import Span
+from curation_ros.core.salvage import good_prefix
+from curation_ros.core.scorers import SCORERS
+from curation_ros.core.scoring import Curation
+
+Row = dict[str, Any]
+
+
+def phases_alone(episode: Episode) -> Episode:
+    """An episode with its phases and stamps alone: all of a study's can be held at once."""
+    names = [spec.name for spec in episode.topic_map.with_role("phase")]
+    return replace(episode, fields={name: episode.fields[name] for name in names})
+
+
+@dataclass(frozen=True)
+class Curated:
+    """Decisions of the curator with its defaults, fitted on no reference.
+
+    Attributes:
+        decisions: id -> decision.
+        prefixes: margin -> id -> good beginning of an episode that broke, nanoseconds from the
+            start stamp. The margin is in control steps; None: the curator's own, and then these
+            are the spans of what it salvages.
+        example: the first episode by name that broke and is salvaged; None where there is none.
+    """
+
+    decisions: Mapping[str, Decision] = field(default_factory=dict)
+    prefixes: Mapping[int | None, Mapping[str, Span]] = field(default_factory=dict)
+    example: Episode | None = None
+
+    def ids(self, verdict: str) -> list[str]:
+        """Sorted ids of the episodes with that verdict."""
+        return sorted(i for i, d in self.decisions.items() if d.verdict == verdict)
+
+    def needs(self, ids: Iterable[str]) -> set[str]:
+        """What the scorers need that decided on these episodes."""
+        deciders = {str(self.decisions[i].evidence.get("decided_by", "")) for i in ids}
+        return {SCORERS[name].needs for name in deciders if name in SCORERS}
+
+
+def curate(episodes: Iterable[Episode], margins: Iterable[int] = ()) -> Curated:
+    """Let the curator decide on episodes as it does by default, without a reference.
+
+    Args:
+        episodes: in any order.
+        margins: control steps; for each of them beginnings with that margin are made, too.
+    """
+    curation = Curation().fit([])
+    decisions: dict[str, Decision] = {}
+    prefixes: dict[int | None, dict[str, Span]] = {None: {}, **{m: {} for m in margins}}
+    example: Episode | None = None
+    for episode in episodes:
+        seen = curation.examine(episode)
+        decision = decisions[episode.id] = curation.judge(seen)
+        broke = seen.breaks.get(str(decision.evidence.get("decided_by")))
+        if decision.verdict == "salvage":
+            prefixes[None][episode.id] = decision.span
+            if broke is not None and (example is None or episode.name < example.name):
+                example = episode
+        for margin in (m for m in prefixes if m is not None):
+            if broke is not None and decision.verdict in ("salvage", "discard"):
+                at = int(np.searchsorted(episode.stamps_ns, episode.start_ns + broke.at_ns))
+                kept = good_prefix(episode, at, margin / episode.rate_hz)
+                if kept is not None:
+                    prefixes[margin][episode.id] = episode.span(*kept)
+            elif decision.verdict == "salvage":  # a spoilt end, which no margin changes
+                prefixes[margin][episode.id] = decision.span
+    return Curated(decisions, prefixes, example)
+
+
+def facts_of(
+    curated: Curated,
+    good: Mapping[str, bool],
+    release_steps: Mapping[str, int],
+    timelines: Mapping[str, Episode],
+) -> Row:
+    """Decisions against the truth.
+
+    Args:
+        curated: the decisions.
+        good: id -> whether it succeeded.
+        release_steps: id -> step at which the gripper opened too early, where it did.
+        timelines: id -> episode, its stamps at least.
+
+    Returns:
+        `verdicts`: of each how many episodes that succeeded and that failed; `decided_by`: how
+        many each scorer decided; `cut_minus_release`: last step that is kept of a salvaged
+        episode minus the step of its release, smallest, middle and largest.
+    """
+    verdicts = {v: {"good": 0, "defective": 0} for v in VERDICTS}
+    deciders: dict[str, int] = {}
+    for i, decision in curated.decisions.items():
+        verdicts[decision.verdict]["good" if good[i] else "defective"] += 1
+        decider = str(decision.evidence.get("decided_by", ""))
+        deciders[decider] = deciders.get(decider, 0) + 1
+    late = [
+        len(timelines[i].within(span)) - 1 - release_steps[i]
+        for i, span in curated.prefixes.get(None, {}).items()
+        if i in release_steps
+    ]
+    return {
+        "verdicts": verdicts,
+        "decided_by": dict(sorted(deciders.items())),
+        "cut_minus_release": {
+            "n": len(late),
+            "min": min(late),
+            "median": median(late),
+            "max": max(late),
+        }
+        if late
+        else None,
+    }
+
+
+def phases_shown(
+    bags: Iterable[tuple[str, Span | None]], timelines: Mapping[str, Episode]
+) -> dict[str, dict[str, int]]:
+    """How much of each phase demonstrations show.
+
+    Args:
+        bags: ids, each with the span that is kept; None: all of it.
+        timelines: id -> episode, its phases at least.
+
+    Returns:
+        Phase -> how many of the `demonstrations` show it, in how many `steps`; empty where phases
+        are not known.
+    """
+    parts = [(i, phase_steps(timelines[i], span) if i in timelines else None) for i, span in bags]
+    shown: dict[str, dict[str, int]] = balance_of(parts).to_json()["shown"]
+    return shown
