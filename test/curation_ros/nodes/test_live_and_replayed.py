@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import io
-import signal
 
 import numpy as np
 import pytest
 from episodes import topic_map
 from graph import Graph, jsonl
+from pausing import PAUSE, RESUME, pausable
 from robot import (
     PERIOD_NS,
     PLATE,
@@ -99,13 +99,13 @@ class Session:
             self.graph.settled(self.dataset, self.takes[name].id)
 
     def record_stalls(self, robot: Robot) -> None:
-        """Stop the curator in mid-episode, and let it go on within the episode or after it."""
+        """Pause the curator in mid-episode, and let it go on within the episode or after it."""
         for seed, name in enumerate(STALLS, 20):
             take = self.takes[name] = libero_take(seed, LONG_STEPS if name == "overflow" else 120)
             first, most = take.until(0.02), take.until(0.98)
             robot.tell(take.started)
             robot.send(take.messages[:first])
-            self.graph.nodes.send("curator", signal.SIGSTOP)
+            self.graph.nodes.send("curator", PAUSE)
             try:
                 robot.send(take.messages[first:most], rate_hz=700.0)
                 if name != "stall_within":
@@ -113,7 +113,7 @@ class Session:
                     robot.tell(take.ended)
                     self.graph.recorded(take.id)
             finally:
-                self.graph.nodes.send("curator", signal.SIGCONT)
+                self.graph.nodes.send("curator", RESUME)
             if name == "stall_within":
                 robot.send(take.messages[most:])
                 robot.tell(take.ended)
@@ -144,11 +144,8 @@ def session(graph, other_graph):
         session.record_reference(robot)
         graph.start("recorder", dataset=session.dataset)
         for place, dataset in ((graph, session.dataset), (other_graph, session.replayed)):
-            place.start(
-                "curator",
-                dataset=dataset,
-                reference=[session.reference],
-            )
+            with pausable():
+                place.start("curator", dataset=dataset, reference=[session.reference])
         graph.ready("recorder", "curator")
         robot.until_heard(2)
         session.record_takes(robot)

@@ -9,6 +9,7 @@ import pytest
 import yaml
 from episodes import topic_map
 from graph import MAPPED, QoSProfile, ReliabilityPolicy
+from pausing import PAUSE, RESUME, pausable
 from robot import Robot, distinct, libero_take, without
 
 from curation_ros.bags.reader import open_bag, read_episode
@@ -25,7 +26,8 @@ def small(graph):
     path = graph.folder / "small.yaml"
     path.write_text(yaml.safe_dump(topic_map().only(SMALL).to_json()))
     dataset = graph.folder / "small"
-    graph.start("recorder", "small", dataset=dataset, topic_map=path)
+    with pausable():
+        graph.start("recorder", "small", dataset=dataset, topic_map=path)
     graph.ready("small")
     kept = topic_map().only(SMALL)
     best_effort = QoSProfile(depth=MAPPED.depth, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -76,18 +78,19 @@ def test_stopped_recorder_takes_what_waits_for_it(graph, small):
     _, robot = small
     dataset = graph.folder / "behind"
     path = graph.folder / "small.yaml"
-    graph.start("recorder", "behind", dataset=dataset, topic_map=path)
+    with pausable():
+        graph.start("recorder", "behind", dataset=dataset, topic_map=path)
     robot.until_heard(2)
     take = small_take(6, 120)
     robot.tell(take.started)
     graph.ready("behind", line=f"recording {take.name}")
     robot.send(take.messages[:60], rate_hz=100.0)
-    graph.nodes.send("behind", signal.SIGSTOP)
+    graph.nodes.send("behind", PAUSE)
     try:
         robot.send(take.messages[60:], rate_hz=100.0)
         graph.nodes.send("behind", signal.SIGINT)
     finally:
-        graph.nodes.send("behind", signal.SIGCONT)
+        graph.nodes.send("behind", RESUME)
     assert graph.expect_exit("behind")[0] == 0
     bag = open_bag(dataset / "episodes" / take.id)
     assert bag.event().event == "aborted"
@@ -97,17 +100,17 @@ def test_stopped_recorder_takes_what_waits_for_it(graph, small):
 
 
 def test_lost_messages_are_counted(graph, small):
-    """A recorder that is stopped for longer than its queues hold, and then goes on."""
+    """A recorder that hangs for longer than its queues hold, and then goes on."""
     dataset, robot = small
     take = small_take(3, 1400)
     robot.tell(take.started)
     robot.send(take.messages[:300])
     graph.quiet(0.3)
-    graph.nodes.send("small", signal.SIGSTOP)
+    graph.nodes.send("small", PAUSE)
     try:
         robot.send(take.messages[300:3900], rate_hz=1000.0)
     finally:
-        graph.nodes.send("small", signal.SIGCONT)
+        graph.nodes.send("small", RESUME)
     robot.send(take.messages[3900:])
     robot.tell(take.ended)
     bag, stats = recorded(graph, dataset, take)

@@ -1,0 +1,37 @@
+"""Nodes that hang for a while, as one does that computes or waits for a disk.
+
+The whole process must not be stopped for that (SIGSTOP) where others publish to it through shared
+memory: about once in fifty it is stopped while it holds a lock there. Who publishes to it is then
+held up for a second and gives that memory up, and the process may hear nothing when it goes on.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+#: Sent to a process started in `pausable`. Its Python stops within some 20 ms, and goes on; the
+#: threads of its transport take messages all the time, until its queues are full.
+PAUSE, RESUME = signal.SIGUSR1, signal.SIGUSR2
+
+
+@contextmanager
+def pausable() -> Iterator[None]:
+    """Processes started in this block, and the nodes that they start, can be paused."""
+    folder = str(Path(__file__).parent / "pausable")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", folder, prepend=os.pathsep)
+        yield
+
+
+@contextmanager
+def stoppable() -> Iterator[None]:
+    """Processes started in this block share no memory: SIGSTOP stops them and nobody else."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
+        yield
