@@ -19,7 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from curation_ros.bags.reader import Bag, episode_of, open_bag
+from curation_ros.bags.reader import Bag, episode_of, hint_of_datasets, open_bag
 from curation_ros.bags.writer import sync_folder
 from curation_ros.core.decisions import Decision, in_force
 from curation_ros.core.errors import BagError, CurationError, EpisodeError
@@ -118,7 +118,8 @@ class Dataset:
             except OSError as err:
                 raise CurationError(f"dataset {self.path}: {err.strerror}") from err
         elif not (self.path / "episodes").is_dir():
-            raise CurationError(f"dataset {self.path}: no folder 'episodes' in it")
+            hint = hint_of_datasets(self.path)
+            raise CurationError(f"dataset {self.path}: no folder 'episodes' in it{hint}")
 
     # --- bags -------------------------------------------------------------------------------
 

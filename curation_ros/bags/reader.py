@@ -9,6 +9,7 @@ import json
 import os
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -38,6 +39,7 @@ from curation_ros.core.status import EpisodeEvent, EventKind, event_from_json, o
 from curation_ros.core.stream import Sample, SampleBlock, Stamps, header_stamps_ns
 from curation_ros.core.topic_map import TopicMap, topic_map_from_json
 
+_FEW = 3
 _UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
@@ -650,13 +652,20 @@ def find_bags(paths: Iterable[Path]) -> list[Path]:
     for path in paths:
         bags = _bags_in(path)
         if not bags:
-            raise BagError(
-                f"{path} has no bag in it" if path.exists() else f"{path}: no such path",
-                finding="missing-file",
-            )
+            problem = f"{path} has no bag in it" if path.exists() else f"{path}: no such path"
+            raise BagError(problem + hint_of_datasets(path), finding="missing-file")
         for bag in bags:
             found.setdefault(bag.resolve(), bag)
     return list(found.values())
+
+
+def hint_of_datasets(folder: Path) -> str:
+    """`: did you mean DATASET?` where datasets are in a folder that is none; else nothing."""
+    with suppress(OSError):
+        inside = sorted(entry for entry in folder.iterdir() if (entry / "episodes").is_dir())
+        if inside:
+            return f": did you mean {' or '.join(str(entry) for entry in inside[:_FEW])}?"
+    return ""
 
 
 def _bags_in(path: Path) -> list[Path]:

@@ -12,8 +12,11 @@ from typing import Any
 from curation_ros.cli.arguments import add_workers
 from curation_ros.cli.output import percent, print_json, progress_console, say
 from curation_ros.configuration import topic_map_or_default
+from curation_ros.core.errors import ConfigError
 from curation_ros.evaluating import evaluate_on_graph, summary
 from curation_ros.workers import spread
+
+_MOST_STEPS = 100_000  # as the sim node has it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,6 +37,8 @@ def run(args: argparse.Namespace) -> int:
     """Print a row a rollout, then the summary."""
     from policy_node.policy import Policy
 
+    if not 1 <= args.max_steps <= _MOST_STEPS:
+        raise ConfigError(f"--max-steps {args.max_steps}: expected 1 to {_MOST_STEPS}")
     policy = Policy.load(args.policy)
     policy.check(topic_map_or_default(""))
     rows = []

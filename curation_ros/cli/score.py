@@ -6,6 +6,7 @@ import argparse
 import inspect
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -76,6 +77,7 @@ def run(args: argparse.Namespace) -> int:
     n_bad, n_twice = 0, 0
     n_known: Counter[bool] = Counter()
     changes: Counter[tuple[str, str]] = Counter()
+    overruled: list[str] = []
     verdicts: Counter[str] = Counter()
     flawed = False
     bags, missing = _find(args.paths)
@@ -113,6 +115,8 @@ def run(args: argparse.Namespace) -> int:
             decision = _logged(dataset, one.path, decision)
             if before is not None and before.verdict != decision.verdict:
                 changes[before.verdict, decision.verdict] += 1
+        elif person := _overruled_by(one.path, decision):
+            overruled.append(f"{decision.name or decision.episode[:8]} ({person})")
         verdicts[decision.verdict] += 1
         n_twice += decision.episode in curation.reference_ids_
         flawed = flawed or bool(decision.findings)
@@ -143,6 +147,9 @@ def run(args: argparse.Namespace) -> int:
     if changes:
         listed = ", ".join(f"{n} from {old} to {new}" for (old, new), n in changes.most_common())
         warn(f"decisions that were there are replaced: {listed}")
+    if overruled:
+        rest = f" and {len(overruled) - _FEW} more" if len(overruled) > _FEW else ""
+        warn(f"a person decided otherwise, and that counts: {', '.join(overruled[:_FEW])}{rest}")
     if not n_read:
         return _NOTHING
     return _FINDINGS if args.check and (flawed or n_bad) else _DONE
@@ -168,6 +175,18 @@ def _logged(dataset: Dataset, path: Path, decision: Decision) -> Decision:
     return replace(
         log_decision(dataset, decision), scores=decision.scores, findings=decision.findings
     )
+
+
+def _overruled_by(path: Path, decision: Decision) -> str:
+    """What a person has decided in the dataset of a bag, where that is another verdict."""
+    if path.parent.name != "episodes" or path.name != decision.episode:
+        return ""
+    with suppress(CurationError):
+        logged = Dataset(path.parent.parent).decisions(decision.episode)
+        held = in_force(logged).get(decision.episode)
+        if held is not None and held.by != CURATOR and held.verdict != decision.verdict:
+            return f"{held.verdict}, by {held.by}"
+    return ""
 
 
 def _curation(args: argparse.Namespace) -> Curation:

@@ -577,6 +577,16 @@ def test_find_bags_expands_datasets_folders_and_files(tmp_path: Path) -> None:
         find_bags([tmp_path / "nowhere"])
 
 
+def test_folder_of_datasets_is_told_from_a_dataset(tmp_path: Path) -> None:
+    (tmp_path / "notes").mkdir()
+    with pytest.raises(BagError, match=r"has no bag in it$"):
+        find_bags([tmp_path])
+    for name in ("ann", "ben"):
+        (tmp_path / name / "episodes").mkdir(parents=True)
+    with pytest.raises(BagError, match=r"has no bag in it: did you mean .*ann or .*ben[?]$"):
+        find_bags([tmp_path])
+
+
 def test_episodes_are_found_in_the_order_of_their_ids(tmp_path: Path) -> None:
     ids = ["01a20164-99af-7f9c-803d-7ad12c0caf76", "01a20164-9be8-79b2-a1b7-789d4261dc45"]
     for episode_id in ids:

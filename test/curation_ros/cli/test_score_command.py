@@ -344,6 +344,22 @@ def test_nothing_is_written_without_being_asked(curation: Run, folder: Path) -> 
     assert sorted(p for p in folder.rglob("*") if "index.sqlite" not in p.name) == before
 
 
+def test_decision_of_a_person_that_counts_is_named_where_nothing_is_written(
+    curation: Run, folder: Path
+) -> None:
+    data = folder / "data"
+    rows = curation("score", data, *_options(folder), "--json").rows
+    decisions = {r["name"]: r["decision"] for r in rows}
+    assert decisions["pick-0"] == "keep"
+    assert curation("override", data, "pick-0", "keep", "--by", "Ada", "--json").code == DONE
+    told = curation("score", data, *_options(folder), "--json")
+    assert (told.rows, told.err) == (rows, "")
+    assert curation("override", data, "pick-0", "discard", "--by", "Ada", "--json").code == DONE
+    told = curation("score", data, *_options(folder), "--json")
+    assert told.rows == rows
+    assert "a person decided otherwise, and that counts: pick-0 (discard, by Ada)" in told.err
+
+
 @pytest.mark.parametrize("as_json", [True, False])
 def test_decision_of_a_person_stays_in_force_beside_new_scores(
     curation: Run, folder: Path, as_json: bool

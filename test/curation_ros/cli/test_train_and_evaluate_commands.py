@@ -103,7 +103,8 @@ def test_starts_that_make_no_sense_are_told(curation: Run, folder: Path) -> None
         told = curation("evaluate", "--policy", row["policy"], "--starts", starts, "--json")
         assert (told.code, told.out) == (USAGE, ""), starts
         assert f"starts {starts!r}" in told.err
-    steps = ["--starts", "official:0:1", "--max-steps", "0"]
-    told = curation("evaluate", "--policy", row["policy"], *steps, "--json")
-    assert (told.code, told.out) == (USAGE, "")
-    assert "max_steps" in told.err
+    for more in ([], ["--graph"]):
+        steps = ["--starts", "official:0:1", "--max-steps", "0", *more]
+        told = curation("evaluate", "--policy", row["policy"], *steps, "--json")
+        assert (told.code, told.out) == (USAGE, "")
+        assert told.err == "error: --max-steps 0: expected 1 to 100000\n"
