@@ -20,7 +20,7 @@ ALPHA = 0.05
 
 
 def answers(found: Row) -> list[str]:
-    """Three to five sentences; where data are missing they say so."""
+    """A few sentences; where data are missing they say so."""
     return [
         _done(found),
         *_harm(found),
@@ -136,16 +136,18 @@ def _claims(found: Row) -> Iterator[str]:
         planned = stage["contrasts"]
         made = [c for c in planned if c.get("value") is not None]
         clear = [c for c in made if c["p_holm"] is not None and c["p_holm"] < ALPHA]
-        listed = "; ".join(
-            f"{c['a']} minus {c['b']} ({c['pool']}, {c['variant']}) {points(c['value'])} points, "
-            f"adjusted p {probability(c['p_holm'])}"
-            for c in clear
-        )
+        worst = max((c["p_holm"] for c in clear), default=None)
         yield (
             f"Of {len(planned)} planned contrasts {len(clear)} are resolved"
-            + (f": {listed}" if listed else "")
+            + (f" (adjusted p at most {probability(worst)})" if clear else "")
             + f"; {len(made) - len(clear)} are not, {len(planned) - len(made)} have no data."
         )
+        where: dict[str, list[str]] = {}
+        for c in clear:
+            said = f"{c['a']} minus {c['b']} {points(c['value'])}"
+            where.setdefault(f"{c['pool']}, {c['variant']}", []).append(said)
+        for place, differences in where.items():
+            yield f"Resolved in {place}, in percentage points: {', '.join(differences)}."
 
 
 def _looks(found: Row) -> Iterator[str]:

@@ -103,7 +103,7 @@ def test_truncated_bag_is_named_and_the_others_are_played(graph, dataset):
     torn.write_bytes(torn.read_bytes()[:-2000])
     graph.decisions.clear()
     # So slowly that we, too, have discovered it before it is over.
-    graph.start("replay", bags=[copy], rate=0.5)
+    graph.start("replay", bags=[copy], rate=1.0)
     graph.until(lambda: any(e.source == "replay" for e in graph.events), "we hear the replay")
     code, log = graph.expect_exit("replay")
     assert code == 0
