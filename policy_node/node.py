@@ -66,7 +66,7 @@ class PolicyNode(Node):
         if self._health.due(now_s):
             problems = [self._problem] if self._problem else []
             problems += self._mapped.check(running=self._episode is not None)
-            self._health.publish(now_s, problems, {})
+            self._health.publish(now_s, problems, self._mapped.seen())
         return False
 
     def close(self) -> None:

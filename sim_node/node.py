@@ -114,7 +114,8 @@ class SimNode(Node):
         if self._health.due(now_s):
             two = self._p["episodes"] > 0 and self.count_publishers("episode") > 1
             problems = ["topic episode has two owners: stop one of them"] if two else []
-            self._health.publish(now_s, problems, {"sync": self._p["sync"]})
+            heard = {f"publishers/{t}": str(self.count_publishers(t)) for t in COMMAND_TOPICS}
+            self._health.publish(now_s, problems, {"sync": self._p["sync"], **heard})
         try:
             return next(self._script)
         except StopIteration:

@@ -25,6 +25,9 @@ from sim_node.env import LiberoEnv, Observation
 from sim_node.output import COMMAND_TOPICS, SimOutput
 from sim_node.phases import PhaseTracker
 
+#: As rmw calls the node of a publisher that it cannot name yet.
+_UNNAMED = "_NODE_NAME_UNKNOWN_"
+
 
 class SimPublishers(SimOutput):
     """All publishers of the sim node; `episode` and the commands exist only for their owner."""
@@ -102,6 +105,8 @@ class SimPublishers(SimOutput):
     def several_commanders(self) -> str:
         """Names of the nodes that command, if they are several or one has two publishers."""
         infos = [i for t in COMMAND_TOPICS for i in self._node.get_publishers_info_by_topic(t)]
+        # A publisher is discovered a moment before the name of its node.
+        infos = [i for i in infos if i.node_name != _UNNAMED]
         owners = {(i.node_namespace, i.node_name) for i in infos}
         if len(owners) <= 1 and len(infos) <= len(COMMAND_TOPICS):
             return ""

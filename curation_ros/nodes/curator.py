@@ -157,7 +157,7 @@ class Curator(Node):
             if self.count_publishers("episode") > 1:
                 problems.insert(0, "topic episode has two owners: stop one of them")
             values = {"decisions": str(len(self._latencies_ms))}
-            values |= counts_to_values(self._live.counts())
+            values |= counts_to_values(self._live.counts()) | self._mapped.seen()
             if self._latencies_ms:
                 middle, worst = np.percentile(list(self._latencies_ms), [50, 99])
                 values |= {"latency_ms_p50": f"{middle:.1f}", "latency_ms_p99": f"{worst:.1f}"}

@@ -27,7 +27,7 @@ from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import array_to_ros, single_from_ros
 from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import DRAIN_S, EVENTS, LATCHED
-from curation_ros.nodes.spinning import run, take_all
+from curation_ros.nodes.spinning import run, take_all, take_arrived
 from curation_ros.nodes.subscriptions import MappedSubscriptions
 from curation_ros.recording import Notice, RecordedTopic, Recording, recover_partials
 
@@ -104,10 +104,12 @@ class Recorder(Node):
     # --- services ---------------------------------------------------------------------------
 
     def _start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        take_arrived(self)
         response.success, response.message = self._by_hand.start() if self._by_hand else _FOLLOWS
         return response
 
     def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        take_arrived(self)
         response.success, response.message = self._by_hand.stop() if self._by_hand else _FOLLOWS
         return response
 
@@ -147,7 +149,7 @@ class Recorder(Node):
             self._recording.topics |= self._topics()
             if self.count_publishers("episode") > 1:
                 problems.insert(0, "topic episode has two owners: stop one of them")
-            self._health.publish(now_s, problems, {"free": self._free()})
+            self._health.publish(now_s, problems, {"free": self._free(), **self._mapped.seen()})
         return False
 
     def close(self) -> None:

@@ -22,6 +22,8 @@ from curation_ros.nodes.parameters import Parameter, described, warn_of_unknown
 _IDLE_S = 0.02
 #: A node that stops has taken everything after so long a silence; a publisher may never be silent.
 _QUIET_S, _DRAIN_S = 0.05, 1.0
+#: Who is asked for something catches up for so long; a publisher may be faster than we are.
+_CATCH_UP_S = 0.2
 
 
 class Worker(Protocol):
@@ -124,6 +126,13 @@ def take_waiting(node: Node) -> bool:
             message, info = taken
             subscription.callback(*((message, info) if subscription.raw else (message,)))
     return any_taken
+
+
+def take_arrived(node: Node) -> None:
+    """Serve all that has arrived: a request may overtake what was sent before it."""
+    deadline_s = time.monotonic() + _CATCH_UP_S
+    while take_waiting(node) and time.monotonic() < deadline_s:
+        pass
 
 
 def take_all(node: Node) -> None:

@@ -54,6 +54,7 @@ class MappedSubscriptions:
         self._types = {t: message_type(name, t) for t, name in topic_map.topics.items()}
         self._subscriptions = {t: self._subscribe(t, MAPPED) for t in topic_map.topics}
         self._reported: set[str] = set()
+        self._seen: dict[str, int] = {}
 
     def _subscribe(self, topic: str, qos: QoSProfile) -> Any:
         by_source = topic in self._map.source_stamped
@@ -111,6 +112,7 @@ class MappedSubscriptions:
         problems = []
         for topic, expected in self._map.topics.items():
             infos = self._node.get_publishers_info_by_topic(self.resolved(topic))
+            self._seen[self.resolved(topic)] = len(infos)
             if running and not infos:
                 problems.append(f"topic {self.resolved(topic)}: no publisher")
             for info in infos:
@@ -136,6 +138,12 @@ class MappedSubscriptions:
                 )
                 self._subscriptions[topic] = self._subscribe(topic, best_effort)
         return problems
+
+    def seen(self) -> dict[str, str]:
+        """For /diagnostics: publishers of `episode` and of each mapped topic, as last checked."""
+        episode = self._node.resolve_topic_name("episode")
+        counts = {episode: self._node.count_publishers(episode), **self._seen}
+        return {f"publishers/{topic.lstrip('/')}": str(n) for topic, n in counts.items()}
 
     def _report(self, problem: str) -> None:
         if problem not in self._reported:

@@ -95,7 +95,10 @@ def test_episodes_equal_those_recorded_on_the_graph(tmp_path: Path) -> None:
             open_bag(Dataset(folder).bag_path(there[name]["episode"]))
             for folder, there in ((in_process, ours), (on_graph, theirs))
         ]
-        assert bags[0].topics == bags[1].topics
+        # Over DDS a first step may be there twice: `forms` has the counts of distinct stamps.
+        assert [{name: topic.type for name, topic in bag.topics.items()} for bag in bags] == [
+            {name: topic.type for name, topic in bags[0].topics.items()}
+        ] * 2
         assert forms(bags[0]) == forms(bags[1])
         assert truth["outcome"] == ("succeeded" if truth["defect"] == "none" else "failed")
 

@@ -87,6 +87,7 @@ def driven(graph, folder):
     graph.nodes.send("recorder", signal.SIGSTOP)
     graph.start("policy_node", policy=folder)
     graph.until(lambda: graph.events, "the episode is announced")
+    assert not [s for s in graph.recorders if s.message.startswith("recording")]
     graph.nodes.send("recorder", signal.SIGCONT)
     code, log = graph.expect_exit("sim_node")
     assert code == 0, log

@@ -6,7 +6,7 @@ import pytest
 import yaml
 from episodes import topic_map
 from graph import MAPPED, JointState, TwistStamped
-from robot import Robot, libero_take, plain, stamp_ns
+from robot import BOWL, PLATE, Robot, libero_take, plain, stamp_ns
 from test_policy import policy
 
 pytestmark = [pytest.mark.ros, pytest.mark.policy]
@@ -26,14 +26,14 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def answers(graph, folder):
     """A robot without commands of its own, and what the policy node has answered."""
-    graph.start("policy_node", policy=folder)
-    graph.ready("policy_node")
+    # First, so that the policy node knows of them when it is heard.
     heard = {topic: [] for topic in COMMANDS}
     for topic, kind in zip(COMMANDS, (TwistStamped, JointState), strict=True):
         graph.node.create_subscription(kind, topic, heard[topic].append, MAPPED)
+    graph.start("policy_node", policy=folder)
     types = {t: kind for t, kind in topic_map().topics.items() if t not in COMMANDS}
     with Robot(graph, types=types) as robot:
-        robot.until_heard(heard=["eef_pose", "phase"])
+        robot.until_heard(heard=["eef_pose", "phase", BOWL, PLATE])
         yield Answers(graph, robot, heard)
     graph.stop("policy_node")
 

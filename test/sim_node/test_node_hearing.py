@@ -93,9 +93,11 @@ def test_first_observation_is_repeated_until_the_recorder_has_its_answer(graph, 
     assert episode.findings == ()
     assert len(episode) == MAX_STEPS
     said = [s for s in graph.recorders if s.hardware_id == event.id]
-    assert [s.message.partition(" ")[0] for s in said] == ["recording", "recording", "closed"]
+    states = [s.message.partition(" ")[0] for s in said]
+    # Once more for each topic that comes later than the gripper's.
+    assert (set(states[:-1]), states[-1]) == ({"recording"}, "closed")
     assert not any(key.startswith("count/") for key in said[0].values)
-    assert said[1].values["count/command/gripper"] == "1"
+    assert "1" in [s.values.get("count/command/gripper") for s in said[1:-1]]
 
 
 def test_recorder_that_never_has_it_aborts_the_episode(graph, hearing):

@@ -14,6 +14,7 @@ PLATE = "objects/plate_1/pose"
 def test_first_step_waits_for_every_topic_and_the_missing_one_is_named(graph: Graph):
     graph.start("recorder", dataset=graph.folder / "data", remaps={PLATE: "elsewhere"})
     graph.start("sim_node", max_steps=3, command_timeout_s=0.1, wait_for=["recorder"])
+    graph.ready("recorder", "sim_node")
     event = graph.until(
         lambda: next((e for e in graph.events if e.event != "started"), None), "the end"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -78,7 +78,7 @@ class Graph:
         self.recorders: list[Status] = []
         self.decisions: list[Status] = []
         self.health: list[Status] = []
-        self._namespaces: set[str] = set()
+        self._clients: dict[str, Any] = {}
 
     def __enter__(self) -> Graph:
         self.domain = Domain()
@@ -151,9 +151,9 @@ class Graph:
         path = self.folder / "logs" / f"{key}.log"
         return path.read_text(errors="replace") if path.exists() else ""
 
-    def expect_exit(self, key: str) -> tuple[int, str]:
+    def expect_exit(self, key: str, timeout_s: float = PATIENCE_S) -> tuple[int, str]:
         """Wait for a node to end by itself; returns its exit code and its output."""
-        self.until(lambda: self.nodes.ended(key) is not None, f"{key} ends")
+        self.until(lambda: self.nodes.ended(key) is not None, f"{key} ends", timeout_s)
         code = self.nodes.ended(key)
         self.stop(key)
         assert code is not None
@@ -233,16 +233,29 @@ class Graph:
 
         return self.until(compared, f"decision on {episode_id} compared with its bag")
 
+    def client(self, kind: Any, service: str) -> Any:
+        """A client of a service that is there, the same one each time: the server knows it."""
+        if service not in self._clients:
+            self._clients[service] = self.node.create_client(kind, service)
+        self.until(self._clients[service].service_is_ready, f"service {service}")
+        return self._clients[service]
+
     def call(self, kind: Any, service: str, request: Any) -> Any:
         """Call a service; returns its response."""
-        client = self.node.create_client(kind, service)
-        try:
-            self.until(client.service_is_ready, f"service {service}")
-            future = client.call_async(request)
-            self.until(future.done, f"answer of {service}")
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
+        future = self.client(kind, service).call_async(request)
+        self.until(future.done, f"answer of {service}")
+        return future.result()
+
+    def counts_publishers(self, node: str, topics: Sequence[str], n: int) -> None:
+        """Wait until a node reports that it sees so many publishers of each topic."""
+        since = len(self.health)
+        wanted = {f"publishers/{topic}": str(n) for topic in topics}
+        self.until(
+            lambda: any(
+                s.name == node and wanted.items() <= s.values.items() for s in self.health[since:]
+            ),
+            f"{node} sees {n} publishers of {' and '.join(topics)}",
+        )
 
     def problem(self, node: str, text: str) -> Status:
         """Wait for a complaint of a node on /diagnostics."""

@@ -344,7 +344,10 @@ class Robot:
         self.node.destroy_node()
 
     def until_heard(self, n: int = 1, *, heard: Sequence[str] | None = None) -> None:
-        """Wait until every topic has so many subscribers, and `episode` our probe beside them."""
+        """Wait until so many nodes subscribe to every topic and `episode`, and have found us, too.
+
+        That we see a subscriber does not say that it has found our publisher.
+        """
         for topic, publisher in self.publishers.items():
             if heard is None or topic in heard:
                 self._graph.until(
@@ -356,7 +359,27 @@ class Robot:
                 lambda: self._episode.get_subscription_count() >= n + 1,
                 f"{n} subscribers on episode",
             )
-        self._graph.quiet(0.5)  # the other side discovers us on its own
+        self._graph.quiet(0.1)  # what waits here may be of a node that has ended
+        since = len(self._graph.health)
+        self._graph.until(lambda: self._is_found(n, since, heard), f"{n} nodes have found {self}")
+
+    def _is_found(self, n: int, since: int, heard: Sequence[str] | None) -> bool:
+        """Whether the newest reports of n nodes count all publishers of our topics.
+
+        Nodes may have one name: as many reports as two rounds of them give count, too.
+        """
+        publishers = [p for t, p in self.publishers.items() if heard is None or t in heard]
+        topics = [p.topic_name for p in (*publishers, self._episode) if p is not None]
+        count = self.node.count_publishers
+        wanted = {f"publishers/{topic.lstrip('/')}": str(count(topic)) for topic in topics}
+        found: list[str] = []
+        for status in reversed(self._graph.health[since:]):
+            seen = {key: status.values[key] for key in wanted if key in status.values}
+            if any(seen[key] != wanted[key] for key in seen):
+                break
+            if seen:
+                found.append(status.name)
+        return len(set(found)) >= n or len(found) >= 2 * n
 
     def tell(self, event: EpisodeEvent) -> None:
         """Publish an event of an episode."""

@@ -176,7 +176,9 @@ def test_kill_costs_a_fraction_of_a_second(graph, robot, sessions):
         graph.until(kept.is_dir, "the torn original")  # moved after the new bag is there
     print(f"lost by kill -9: {', '.join(f'{1e3 * s:.0f} ms' for s in lost_s.values())}")
     # What was on disk is never lost. Of the rest a busy machine may keep one of them from all.
-    assert max(lost_s.values()) < LAST / len(distinct(sessions.take.messages)) / RATE_HZ + 1e-6
+    # A step that is not whole is lost, too.
+    n_topics = len(distinct(sessions.take.messages))
+    assert max(lost_s.values()) < (LAST / n_topics + 1.0) / RATE_HZ + 1e-6
     assert min(lost_s.values()) < MOST_LOST_S
 
 

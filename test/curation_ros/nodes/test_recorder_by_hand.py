@@ -6,6 +6,9 @@ import json
 import signal
 
 import pytest
+from episodes import topic_map
+from graph import PATIENCE_S
+from pausing import PAUSE, RESUME, pausable
 from robot import PERIOD_NS, Robot, libero_take, stamp_ns
 from std_srvs.srv import SetBool, Trigger
 
@@ -60,6 +63,12 @@ def stream(graph, dataset):
 
 def by_hand(graph, service):
     return graph.call(Trigger, f"recorder/{service}", Trigger.Request())
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch):
+    """A command joins the graph anew each time, which takes seconds on a busy machine."""
+    monkeypatch.setattr("curation_ros.cli.record._PATIENCE_S", PATIENCE_S)
 
 
 def command_line(capsys, *words):
@@ -150,7 +159,14 @@ def test_start_twice_and_stop_twice_are_refused(graph, dataset, stream, capsys):
 def test_stopped_in_mid_episode_the_owner_says_so(graph, dataset, stream):
     started = json.loads(by_hand(graph, "start").message)
     stream.go_on(15)
-    graph.quiet(0.5)  # it has taken everything
+    # The curator has everything; the recorder takes what it has not, before it goes.
+    everything = {f"count/{topic}": "15" for topic in topic_map().topics}
+
+    def has_everything():
+        mine = [s.values for s in graph.health if s.hardware_id == started["episode"]]
+        return any(everything.items() <= values.items() for values in mine)
+
+    graph.until(has_everything, "the curator has 15 steps")
     graph.nodes.send("recorder", signal.SIGINT)
     code, log = graph.expect_exit("recorder")
     assert code == 0, log
@@ -171,11 +187,40 @@ def test_stopped_in_mid_episode_the_owner_says_so(graph, dataset, stream):
 
 
 def test_numbers_go_on_after_a_restart(graph, dataset, stream):
-    graph.start("recorder", dataset=dataset, auto=False, task="pour")
+    with pausable():
+        graph.start("recorder", dataset=dataset, auto=False, task="pour")
     stream.robot.until_heard(2)
     stream.go_on(3)
     assert json.loads(by_hand(graph, "start").message)["name"] == "pour-0005"
     assert by_hand(graph, "stop").success
+
+
+@pytest.mark.parametrize("pressed", ["start", "stop"])
+def test_what_was_sent_before_a_button_was_pressed_is_before_it(graph, dataset, stream, pressed):
+    """The recorder is behind, and finds the request together with what was sent before."""
+    if pressed == "stop":
+        assert by_hand(graph, "start").success
+    client = graph.node.create_client(Trigger, f"recorder/{pressed}")
+    graph.until(client.service_is_ready, "the service")
+    graph.nodes.send("recorder", PAUSE)
+    graph.quiet(0.1)
+    stream.go_on(30)
+    button = client.call_async(Trigger.Request())
+    graph.quiet(0.2)
+    graph.nodes.send("recorder", RESUME)
+    graph.until(button.done, "the answer")
+    told = json.loads(button.result().message)
+    graph.node.destroy_client(client)
+    if pressed == "start":
+        event = graph.until(
+            lambda: next((e for e in graph.events if e.id == told["episode"]), None), "its start"
+        )
+        assert event.start_ns == stream.last_ns + 1
+        assert by_hand(graph, "stop").success
+    else:
+        stream.go_on(5)
+        graph.recorded(told["episode"])
+        assert len(read_episode(dataset / "episodes" / told["episode"])) == 30
 
 
 def test_no_recorder_is_one_line(graph, dataset, stream, capsys, monkeypatch):
