@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from graph import PATIENCE_S
-from pausing import PAUSE, RESUME, pausable, stoppable
+from pausing import PAUSE, RESUME, pausable
 
 from curation_ros.bags.reader import read_episode
 from curation_ros.cli.main import main as curation
@@ -70,8 +70,7 @@ def driven(graph, folder):
     The sim knows both then. A recorder that is stopped is on the graph, and answers nobody.
     """
     dataset = graph.folder / "driven"
-    with stoppable():
-        graph.start("recorder", dataset=dataset)
+    graph.start("recorder", dataset=dataset)
     graph.start(
         "sim_node",
         dataset=dataset,
@@ -82,7 +81,8 @@ def driven(graph, folder):
         wait_for=["policy_node", "recorder"],
     )
     graph.ready("recorder", "sim_node")
-    # Until their announcements, which begin close together, have become rare.
+    # Until their announcements, which begin close together, have become rare: who is stopped while
+    # it takes a message may hold up the others (see pausing.py).
     graph.quiet(4.0)
     graph.nodes.send("recorder", signal.SIGSTOP)
     graph.start("policy_node", policy=folder)

@@ -1,8 +1,9 @@
 """Nodes that hang for a while, as one does that computes or waits for a disk.
 
-The whole process must not be stopped for that (SIGSTOP) where others publish to it through shared
+The whole process must not be stopped for that (SIGSTOP) while others publish to it through shared
 memory: about once in fifty it is stopped while it holds a lock there. Who publishes to it is then
 held up for a second and gives that memory up, and the process may hear nothing when it goes on.
+With discovery on this machine alone, rmw_fastrtps has no other transport.
 """
 
 from __future__ import annotations
@@ -26,12 +27,4 @@ def pausable() -> Iterator[None]:
     folder = str(Path(__file__).parent / "pausable")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", folder, prepend=os.pathsep)
-        yield
-
-
-@contextmanager
-def stoppable() -> Iterator[None]:
-    """Processes started in this block share no memory: SIGSTOP stops them and nobody else."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
         yield
