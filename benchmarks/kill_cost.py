@@ -45,7 +45,7 @@ def one(folder: Path, after_s: float) -> float:
             assert sender.stdout is not None
             begun = json.loads(sender.stdout.readline())
             time.sleep(after_s)
-            nodes.signal("recorder", signal.SIGKILL)
+            nodes.send("recorder", signal.SIGKILL)
             killed_ns = time.time_ns()
             sender.communicate()
     finally:

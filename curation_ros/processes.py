@@ -188,10 +188,6 @@ class Nodes:
             time.sleep(0.05)
         self.check()
 
-    def signal(self, key: str, number: int) -> None:
-        """Send a signal to a process."""
-        self._running[key][0].send_signal(number)
-
     def stop(self, key: str) -> None:
         """End a process: asked first, made to in the end."""
         process, log = self._running.pop(key)

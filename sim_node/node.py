@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 
 from curation_ros.core.status import ERROR, OK, Status, counts_from_status
 from curation_ros.dataset import Dataset
-from curation_ros.nodes.health import Health
+from curation_ros.nodes.health import Health, publishers_found
 from curation_ros.nodes.messages import status_from_ros, time_from_ros
 from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import LATCHED, MAPPED
@@ -114,8 +114,9 @@ class SimNode(Node):
         if self._health.due(now_s):
             two = self._p["episodes"] > 0 and self.count_publishers("episode") > 1
             problems = ["topic episode has two owners: stop one of them"] if two else []
-            heard = {f"publishers/{t}": str(self.count_publishers(t)) for t in COMMAND_TOPICS}
-            self._health.publish(now_s, problems, {"sync": self._p["sync"], **heard})
+            commands = map(self.resolve_topic_name, COMMAND_TOPICS)
+            found = publishers_found({t: self.count_publishers(t) for t in commands})
+            self._health.publish(now_s, problems, {"sync": self._p["sync"], **found})
         try:
             return next(self._script)
         except StopIteration:

@@ -14,6 +14,11 @@ from curation_ros.nodes.qos import EVENTS
 _PERIOD_S = 1.0
 
 
+def publishers_found(counts: Mapping[str, int]) -> dict[str, str]:
+    """Values for a report: how many publishers of each topic, by full name, a node has found."""
+    return {f"publishers/{topic.lstrip('/')}": str(n) for topic, n in counts.items()}
+
+
 class Health:
     """Publishes one status a node: OK, or ERROR with the first problem as its message."""
 

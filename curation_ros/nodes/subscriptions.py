@@ -13,6 +13,7 @@ from curation_ros.bags.qos import QosProfile
 from curation_ros.core.errors import ConfigError, EpisodeError
 from curation_ros.core.stream import Sample, header_stamp_ns
 from curation_ros.core.topic_map import TopicMap
+from curation_ros.nodes.health import publishers_found
 from curation_ros.nodes.qos import MAPPED
 
 
@@ -142,8 +143,7 @@ class MappedSubscriptions:
     def seen(self) -> dict[str, str]:
         """For /diagnostics: publishers of `episode` and of each mapped topic, as last checked."""
         episode = self._node.resolve_topic_name("episode")
-        counts = {episode: self._node.count_publishers(episode), **self._seen}
-        return {f"publishers/{topic.lstrip('/')}": str(n) for topic, n in counts.items()}
+        return publishers_found({episode: self._node.count_publishers(episode), **self._seen})
 
     def _report(self, problem: str) -> None:
         if problem not in self._reported:
