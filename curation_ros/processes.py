@@ -157,6 +157,10 @@ class Nodes:
         """Send a signal to a process."""
         self._running[key][0].send_signal(number)
 
+    def pid(self, key: str) -> int:
+        """Process id."""
+        return self._running[key][0].pid
+
     def ended(self, key: str) -> int | None:
         """Exit code of a process, None while it runs."""
         return self._running[key][0].poll()

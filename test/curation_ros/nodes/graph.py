@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any
 
 import pytest
+from pausing import PAUSE, RESUME, stands_still
 
 from curation_ros.core.decisions import Decision
 from curation_ros.core.errors import EpisodeError
@@ -145,6 +146,15 @@ class Graph:
         """Stop nodes that were started."""
         for key in keys:
             self.nodes.stop(key)
+
+    def pause(self, key: str) -> None:
+        """Make a node hang that was started in `pausing.pausable`, and see that it does."""
+        self.nodes.send(key, PAUSE)
+        self.until(lambda: stands_still(self.nodes.pid(key)), f"{key} hangs")
+
+    def resume(self, key: str) -> None:
+        """Let a node go on."""
+        self.nodes.send(key, RESUME)
 
     def log(self, key: str) -> str:
         """What a node has printed."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,20 @@ import pytest
 #: Sent to a process started in `pausable`. Its Python stops within some 20 ms, and goes on; the
 #: threads of its transport take messages all the time, until its queues are full.
 PAUSE, RESUME = signal.SIGUSR1, signal.SIGUSR2
+#: A node that spins wakes up several times in that.
+_STILL_S = 0.1
+
+
+def stands_still(pid: int) -> bool:
+    """Whether the main thread of a node, which wakes up every 20 ms, does so no more."""
+    before = _switches(pid)
+    time.sleep(_STILL_S)
+    return _switches(pid) == before
+
+
+def _switches(pid: int) -> int:
+    status = Path(f"/proc/{pid}/task/{pid}/status").read_text()
+    return sum(int(line.split()[1]) for line in status.splitlines() if "ctxt_switches" in line)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from episodes import topic_map
 from graph import Graph, jsonl
-from pausing import PAUSE, RESUME, pausable
+from pausing import pausable
 from robot import (
     PERIOD_NS,
     PLATE,
@@ -105,7 +105,7 @@ class Session:
             first, most = take.until(0.02), take.until(0.98)
             robot.tell(take.started)
             robot.send(take.messages[:first])
-            self.graph.nodes.send("curator", PAUSE)
+            self.graph.pause("curator")
             try:
                 robot.send(take.messages[first:most], rate_hz=700.0)
                 if name != "stall_within":
@@ -113,7 +113,7 @@ class Session:
                     robot.tell(take.ended)
                     self.graph.recorded(take.id)
             finally:
-                self.graph.nodes.send("curator", RESUME)
+                self.graph.resume("curator")
             if name == "stall_within":
                 robot.send(take.messages[most:])
                 robot.tell(take.ended)

@@ -8,7 +8,7 @@ import signal
 import pytest
 from episodes import topic_map
 from graph import PATIENCE_S
-from pausing import PAUSE, RESUME, pausable
+from pausing import pausable
 from robot import PERIOD_NS, Robot, libero_take, stamp_ns
 from std_srvs.srv import SetBool, Trigger
 
@@ -202,12 +202,11 @@ def test_what_was_sent_before_a_button_was_pressed_is_before_it(graph, dataset, 
         assert by_hand(graph, "start").success
     client = graph.node.create_client(Trigger, f"recorder/{pressed}")
     graph.until(client.service_is_ready, "the service")
-    graph.nodes.send("recorder", PAUSE)
-    graph.quiet(0.1)
+    graph.pause("recorder")
     stream.go_on(30)
     button = client.call_async(Trigger.Request())
     graph.quiet(0.2)
-    graph.nodes.send("recorder", RESUME)
+    graph.resume("recorder")
     graph.until(button.done, "the answer")
     told = json.loads(button.result().message)
     graph.node.destroy_client(client)

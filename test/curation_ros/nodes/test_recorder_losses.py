@@ -9,7 +9,7 @@ import pytest
 import yaml
 from episodes import topic_map
 from graph import MAPPED, QoSProfile, ReliabilityPolicy
-from pausing import PAUSE, RESUME, pausable
+from pausing import pausable
 from robot import Robot, distinct, libero_take, without
 
 from curation_ros.bags.reader import open_bag, read_episode
@@ -85,12 +85,12 @@ def test_stopped_recorder_takes_what_waits_for_it(graph, small):
     robot.tell(take.started)
     graph.ready("behind", line=f"recording {take.name}")
     robot.send(take.messages[:60], rate_hz=100.0)
-    graph.nodes.send("behind", PAUSE)
+    graph.pause("behind")
     try:
         robot.send(take.messages[60:], rate_hz=100.0)
         graph.nodes.send("behind", signal.SIGINT)
     finally:
-        graph.nodes.send("behind", RESUME)
+        graph.resume("behind")
     assert graph.expect_exit("behind")[0] == 0
     bag = open_bag(dataset / "episodes" / take.id)
     assert bag.event().event == "aborted"
@@ -106,11 +106,11 @@ def test_lost_messages_are_counted(graph, small):
     robot.tell(take.started)
     robot.send(take.messages[:300])
     graph.quiet(0.3)
-    graph.nodes.send("small", PAUSE)
+    graph.pause("small")
     try:
         robot.send(take.messages[300:3900], rate_hz=1000.0)
     finally:
-        graph.nodes.send("small", RESUME)
+        graph.resume("small")
     robot.send(take.messages[3900:])
     robot.tell(take.ended)
     bag, stats = recorded(graph, dataset, take)
