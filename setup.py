@@ -17,7 +17,7 @@ except ImportError:  # newer than any that colcon can use
 PACKAGE = "curation_ros"
 NODES = ("sim_node", "recorder", "curator", "policy_node", "replay")
 EXECUTABLES = {
-    **{node: f"curation_ros.executables:{node}" for node in NODES},
+    **{node: f"curation_ros.nodes.executables:{node}" for node in NODES},
     "curation": "curation_ros.cli.main:main",
 }
 # Not imported: nothing is installed yet. package.xml repeats the version, and a test compares.

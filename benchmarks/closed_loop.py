@@ -33,9 +33,9 @@ from numpy.typing import NDArray
 from one_core import rows_of
 
 from curation_ros.bags.reader import read_episode
-from curation_ros.collecting import Collection, collect
-from curation_ros.core.phases import PHASES
-from curation_ros.dataset import Dataset
+from curation_ros.core.episode.phases import PHASES
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.study.collect import Collection, collect
 from policy_node.controller import PolicyController
 from policy_node.policy import Policy
 from policy_node.rollouts import field_values, rollout

@@ -29,19 +29,19 @@ from typing import Any
 import numpy as np
 
 from curation_ros.bags.reader import read_episode
-from curation_ros.collecting import Collection, collect
 from curation_ros.configuration import topic_map_or_default
-from curation_ros.core.alerts import AlertWatch
-from curation_ros.core.carrying import Carrying, carrying_of
-from curation_ros.core.episode import Episode
-from curation_ros.core.grip import grip_of
-from curation_ros.core.intervals import clopper_pearson
-from curation_ros.core.rules import RULES
+from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.rules import RULES
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.topic_map import TopicMap, topic_map_from_json
+from curation_ros.core.evidence.alerts import AlertWatch
+from curation_ros.core.evidence.carrying import Carrying, carrying_of
+from curation_ros.core.evidence.fingers import grip_of
 from curation_ros.core.scorers import SCORERS, Abstain
-from curation_ros.core.scoring import Curation
-from curation_ros.core.stream import NS_PER_S
-from curation_ros.core.topic_map import TopicMap, topic_map_from_json
-from curation_ros.dataset import Dataset
+from curation_ros.core.statistics.intervals import clopper_pearson
+from curation_ros.core.types import NS_PER_S
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.study.collect import Collection, collect
 from sim_node.defects import DEFECTS
 
 CHOSEN_ON, REPORTED = (101,), (107, 108, 109, 110, 111, 112)

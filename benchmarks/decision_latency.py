@@ -20,12 +20,13 @@ from robot import Robot, stamped
 
 from curation_ros.bags.reader import open_bag
 from curation_ros.configuration import topic_map_or_default
-from curation_ros.core.identity import new_episode_id
-from curation_ros.core.status import EpisodeEvent
-from curation_ros.core.stream import NS_PER_S, playback_order
+from curation_ros.core.episode.identity import new_episode_id
+from curation_ros.core.episode.status import EpisodeEvent
+from curation_ros.core.episode.stream import playback_order
+from curation_ros.core.types import NS_PER_S
 from curation_ros.nodes.messages import status_from_ros
+from curation_ros.nodes.processes import Domain, Nodes
 from curation_ros.nodes.qos import EVENTS
-from curation_ros.processes import Domain, Nodes
 
 COMMAND = "python benchmarks/run.py decision_latency"
 N_EPISODES = 100

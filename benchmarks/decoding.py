@@ -29,12 +29,12 @@ from rosbags.typesys import Stores, get_typestore
 
 from curation_ros.bags import BagWriter, open_bag, read_episode
 from curation_ros.configuration import topic_map_or_default
-from curation_ros.core.episode import Episode
-from curation_ros.core.identity import new_episode_id
-from curation_ros.core.scoring import Curation
-from curation_ros.core.status import EpisodeEvent, event_to_json
-from curation_ros.core.stream import NS_PER_S
-from curation_ros.core.topic_map import TopicMap, topic_map_from_json
+from curation_ros.core.decision.curation import Curation
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.identity import new_episode_id
+from curation_ros.core.episode.status import EpisodeEvent, event_to_json
+from curation_ros.core.episode.topic_map import TopicMap, topic_map_from_json
+from curation_ros.core.types import NS_PER_S
 
 COMMAND = "python benchmarks/decoding.py"
 N_ROUNDS = 9

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from curation_ros.bags.reader import read_episode
-from curation_ros.collecting import Collection, collect
-from curation_ros.core.intervals import clopper_pearson
-from curation_ros.dataset import Dataset
-from curation_ros.workers import spread
+from curation_ros.batch.workers import spread
+from curation_ros.core.statistics.intervals import clopper_pearson
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.study.collect import Collection, collect
 from policy_node.batch_training import FailedTraining, TrainingJob, train_many
 from policy_node.policy import Policy
 from policy_node.rollouts import GiveUp, SimController

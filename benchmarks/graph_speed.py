@@ -10,10 +10,10 @@ from typing import Any
 
 from decision_latency import record
 
-from curation_ros.dataset import Dataset
-from curation_ros.evaluating import evaluate_on_graph
-from curation_ros.processes import Domain, Nodes
-from curation_ros.selecting import read_selected, save_selection
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.manifests import read_selected, save_selection
+from curation_ros.nodes.evaluate import evaluate_on_graph
+from curation_ros.nodes.processes import Domain, Nodes
 from policy_node.train import train
 
 COMMAND = "python benchmarks/run.py graph_speed"

@@ -17,11 +17,11 @@ import streams
 import yaml
 
 from curation_ros.bags.reader import open_bag
-from curation_ros.core.stream import NS_PER_S
-from curation_ros.core.topic_map import topic_map_from_json
-from curation_ros.dataset import Dataset
-from curation_ros.processes import Domain, Nodes
-from curation_ros.recording import recover_partials
+from curation_ros.core.episode.topic_map import topic_map_from_json
+from curation_ros.core.types import NS_PER_S
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.live.recorder import recover_partials
+from curation_ros.nodes.processes import Domain, Nodes
 
 COMMAND = "python benchmarks/run.py kill_cost"
 N_KILLS = 8

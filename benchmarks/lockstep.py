@@ -30,10 +30,12 @@ from mcap.reader import make_reader
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
-from curation_ros.core.phases import PHASES
-from curation_ros.core.status import phase_to_status
-from curation_ros.core.stream import NS_PER_S, header_stamp_ns
-from curation_ros.dataset import Dataset
+from curation_ros.core.episode.phases import PHASES
+from curation_ros.core.episode.status import phase_to_status
+from curation_ros.core.episode.stream import header_stamp_ns
+from curation_ros.core.types import NS_PER_S
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.manifests import read_selected, save_selection
 from curation_ros.nodes.messages import (
     array_to_ros,
     joints_to_ros,
@@ -41,9 +43,8 @@ from curation_ros.nodes.messages import (
     time_from_ros,
     twist_to_ros,
 )
+from curation_ros.nodes.processes import Domain, Nodes
 from curation_ros.nodes.qos import MAPPED
-from curation_ros.processes import Domain, Nodes
-from curation_ros.selecting import read_selected, save_selection
 
 COMMAND = "python benchmarks/run.py lockstep"
 N_ROUNDS, N_EPISODES, MAX_STEPS, N_BARE = 3, 3, 250, 500

@@ -19,9 +19,9 @@ from typing import Any
 from curation_ros.bags.reader import Bag, open_bag
 from curation_ros.bags.schemas import MessageSchema
 from curation_ros.bags.writer import BagWriter
-from curation_ros.core.identity import new_episode_id
-from curation_ros.core.stream import NS_PER_S
-from curation_ros.dataset import Dataset
+from curation_ros.core.episode.identity import new_episode_id
+from curation_ros.core.types import NS_PER_S
+from curation_ros.dataset.dataset import Dataset
 
 COMMAND = "python benchmarks/run.py many_episodes"
 SIZES = (100, 1000, 10_000)

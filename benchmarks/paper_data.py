@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from curation_ros.processes import Domain, Nodes
+from curation_ros.nodes.processes import Domain, Nodes
 
 _CONTAMINATED: dict[str, Any] = {"episodes": 80, "contamination": 0.8, "defect": "early_release"}
 DATASETS: dict[str, dict[str, Any]] = {

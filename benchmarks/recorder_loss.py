@@ -15,7 +15,7 @@ import streams
 import yaml
 
 from curation_ros.bags.reader import open_bag
-from curation_ros.processes import Domain, Nodes
+from curation_ros.nodes.processes import Domain, Nodes
 
 COMMAND = "python benchmarks/run.py recorder_loss"
 SECONDS = 60.0

@@ -14,8 +14,8 @@ import rclpy.context
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 
-from curation_ros.core.status import EpisodeEvent, Status, event_to_status
-from curation_ros.core.stream import NS_PER_S
+from curation_ros.core.episode.status import EpisodeEvent, Status, event_to_status
+from curation_ros.core.types import NS_PER_S
 from curation_ros.nodes.messages import array_to_ros, single_from_ros
 from curation_ros.nodes.qos import DECISIONS, LATCHED, MAPPED
 from curation_ros.nodes.subscriptions import message_type

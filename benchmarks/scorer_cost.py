@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from curation_ros.auditing import PAPER
 from curation_ros.bags.reader import read_episode
-from curation_ros.core.episode import Episode
+from curation_ros.batch.audit import PAPER
+from curation_ros.core.episode.episode import Episode
 from curation_ros.core.scorers import SCORERS, Scorer
 
 COMMAND = "python benchmarks/run.py scorer_cost"

@@ -15,9 +15,9 @@ import rclpy.serialization
 from robot import Robot, stamped
 from sensor_msgs.msg import JointState
 
-from curation_ros.core.identity import new_episode_id
-from curation_ros.core.status import EpisodeEvent
-from curation_ros.core.stream import NS_PER_S
+from curation_ros.core.episode.identity import new_episode_id
+from curation_ros.core.episode.status import EpisodeEvent
+from curation_ros.core.types import NS_PER_S
 
 N_TOPICS = 10
 RATE_HZ = 200

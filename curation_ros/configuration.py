@@ -10,11 +10,11 @@ from typing import Any
 import yaml
 
 from curation_ros.bags.reader import find_bags, read_episode
-from curation_ros.core.episode import Episode
+from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.rules import RULES, NoRule
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.topic_map import TopicMap, read_topic_map
 from curation_ros.core.errors import ConfigError
-from curation_ros.core.rules import RULES, NoRule
-from curation_ros.core.scoring import Curation
-from curation_ros.core.topic_map import TopicMap, read_topic_map
 
 _SOURCE = Path(__file__).resolve().parents[1]
 #: What YAML must hold for each keyword of Curation.

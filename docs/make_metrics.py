@@ -15,11 +15,11 @@ import sys
 from pathlib import Path
 from typing import get_args
 
-from curation_ros.core.findings import FINDINGS
-from curation_ros.core.length_control import MODES
-from curation_ros.core.rules import RULES
+from curation_ros.core.decision.rules import RULES
+from curation_ros.core.decision.selection import KEEP_RULES
+from curation_ros.core.episode.findings import FINDINGS
+from curation_ros.core.evidence.length_control import MODES
 from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, Need, PoolScorer, Scorer
-from curation_ros.core.selection import KEEP_RULES
 
 HERE = Path(__file__).resolve().parent
 METRICS = HERE / "metrics.md"

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from curation_ros.core.episode import Episode
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import CurationError, PolicyError
-from curation_ros.core.gripper import is_closed_command, is_open_command
-from curation_ros.core.stream import Floats
-from curation_ros.core.topic_map import TopicMap
-from policy_node.observation import Span
+from curation_ros.core.evidence.gripper import is_closed_command, is_open_command
+from curation_ros.core.types import Floats, Span
 
 TWIST = "twist"
 GRIPPER_OPEN, GRIPPER_CLOSED = -1.0, 1.0

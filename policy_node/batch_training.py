@@ -13,10 +13,10 @@ from typing import NamedTuple
 import torch
 from torch.optim.adam import adam
 
-from curation_ros.core.episode import Episode
+from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import CurationError, PolicyError
+from curation_ros.core.types import Span
 from policy_node.action import N_OUTPUTS
-from policy_node.observation import Span
 from policy_node.train import (
     CURVE_EVERY,
     Settings,

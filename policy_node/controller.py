@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from curation_ros.core.errors import PolicyError
-from curation_ros.core.stream import Floats
+from curation_ros.core.types import Floats
 from policy_node.observation import PHASE
 from policy_node.policy import Policy
 

@@ -13,9 +13,10 @@ from sensor_msgs.msg import JointState
 
 from curation_ros.bags.cdr import CdrDecoder
 from curation_ros.configuration import topic_map_or_default
+from curation_ros.core.episode.status import EpisodeEvent, event_from_status
+from curation_ros.core.episode.stream import Sample
 from curation_ros.core.errors import ConfigError, CurationError
-from curation_ros.core.status import EpisodeEvent, event_from_status
-from curation_ros.core.stream import Floats, Sample
+from curation_ros.core.types import Floats
 from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import joints_to_ros, single_from_ros, twist_to_ros
 from curation_ros.nodes.parameters import Parameter, declare

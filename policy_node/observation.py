@@ -9,13 +9,12 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from curation_ros.core.episode import Episode
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.phases import PHASES
+from curation_ros.core.episode.topic_map import AT_START, TopicMap
 from curation_ros.core.errors import PolicyError
-from curation_ros.core.phases import PHASES
-from curation_ros.core.stream import Floats
-from curation_ros.core.topic_map import AT_START, TopicMap
+from curation_ros.core.types import Floats, Span
 
-Span = tuple[int, int]
 Operands = tuple[tuple[str, bool], ...]
 
 PHASE = "phase"

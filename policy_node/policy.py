@@ -17,9 +17,9 @@ import numpy.typing as npt
 import safetensors.numpy
 from safetensors import SafetensorError
 
+from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import PolicyError
-from curation_ros.core.stream import Floats
-from curation_ros.core.topic_map import TopicMap
+from curation_ros.core.types import Floats
 from policy_node.action import N_OUTPUTS, ActionSpec
 from policy_node.observation import ObservationSpec
 

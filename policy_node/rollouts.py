@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from curation_ros.core.phases import PHASES
-from curation_ros.core.stream import Floats
+from curation_ros.core.episode.phases import PHASES
+from curation_ros.core.types import Floats
 from policy_node.controller import PolicyController
 from policy_node.policy import Policy
 from sim_node.env import BOWL, PLATE, LiberoEnv, Observation

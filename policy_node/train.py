@@ -15,13 +15,13 @@ import numpy as np
 import torch
 
 import curation_ros
-from curation_ros.core.episode import Episode
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.identity import new_episode_id
+from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.errors import PolicyError
-from curation_ros.core.identity import new_episode_id
-from curation_ros.core.phases import PHASES
-from curation_ros.core.stream import Floats
+from curation_ros.core.types import Floats, Span
 from policy_node.action import N_OUTPUTS, ActionSpec
-from policy_node.observation import ObservationSpec, Span
+from policy_node.observation import ObservationSpec
 from policy_node.policy import Card, Policy, Weights, standardise
 
 CURVE_EVERY = 100

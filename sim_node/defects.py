@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from curation_ros.core.types import Floats
 from sim_node import phases
 from sim_node.env import BOWL, GRIPPER_OPEN, Observation
 from sim_node.expert import Controller
-
-Floats = NDArray[np.float64]
 
 
 class DefectiveController(Controller, Protocol):

@@ -7,10 +7,10 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from curation_ros.core.episode.identity import new_episode_id
+from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.core.errors import SimError
-from curation_ros.core.identity import new_episode_id
-from curation_ros.core.status import EpisodeEvent
-from curation_ros.core.stream import NS_PER_S
+from curation_ros.core.types import NS_PER_S
 from sim_node.defects import DefectiveController
 from sim_node.env import LiberoEnv, Observation
 from sim_node.episodes import EpisodePlan

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from curation_ros.core.errors import ConfigError, SimError
+from curation_ros.core.types import Floats
 from sim_node import compiled_task, quiet_libero
 
 _LOGGER = logging.getLogger(__name__)
 
-Floats = NDArray[np.float64]
 
 CONTROL_RATE_HZ = 20
 N_SETTLE_STEPS = 10

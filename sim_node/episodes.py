@@ -6,17 +6,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.errors import ConfigError
-from curation_ros.core.phases import PHASES
+from curation_ros.core.types import Floats
 from sim_node.defects import DEFECTS, DefectiveController
 from sim_node.env import LiberoEnv, Observation
 from sim_node.expert import Controller, Expert, ExpertParams
 from sim_node.phases import PhaseTracker
 from sim_node.starts import Start
-
-Floats = NDArray[np.float64]
 
 MAX_STEPS = 500
 STEPS_AFTER_SUCCESS = 20

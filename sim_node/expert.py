@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from curation_ros.core.phases import PHASES
+from curation_ros.core.episode.phases import PHASES
+from curation_ros.core.types import Floats
 from sim_node import phases
 from sim_node.env import BOWL, GRIPPER_CLOSE, GRIPPER_OPEN, PLATE, Observation
-
-Floats = NDArray[np.float64]
 
 
 class Controller(Protocol):

@@ -13,8 +13,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from curation_ros.core.status import ERROR, OK, Status, counts_from_status
-from curation_ros.dataset import Dataset
+from curation_ros.core.episode.status import ERROR, OK, Status, counts_from_status
+from curation_ros.dataset.dataset import Dataset
 from curation_ros.nodes.health import Health, publishers_found
 from curation_ros.nodes.messages import status_from_ros, time_from_ros
 from curation_ros.nodes.parameters import Parameter, declare

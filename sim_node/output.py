@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 
-from curation_ros.core.status import EpisodeEvent, Status, phase_to_status
+from curation_ros.core.episode.status import EpisodeEvent, Status, phase_to_status
 from sim_node.env import LiberoEnv, Observation
 from sim_node.phases import PhaseTracker
 

@@ -8,12 +8,11 @@ has lost the bowl passes through the same phases as one that has not.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from curation_ros.core.phases import PHASES
+from curation_ros.core.episode.phases import PHASES
+from curation_ros.core.types import Floats
 from sim_node.env import BOWL, PLATE, Observation
-
-Floats = NDArray[np.float64]
 
 PREGRASP, DESCEND, GRASP, LIFT, TRANSPORT, RELEASE = range(len(PHASES))
 

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
-from curation_ros.core.status import EpisodeEvent, Status, event_to_status
+from curation_ros.core.episode.status import EpisodeEvent, Status, event_to_status
 from curation_ros.nodes.delivery import deliver
 from curation_ros.nodes.matching import Matching
 from curation_ros.nodes.messages import (

@@ -12,13 +12,11 @@ import threading
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from curation_ros.core.errors import ConfigError, SimError
+from curation_ros.core.types import Floats
 from sim_node import quiet_libero
 from sim_node.env import BOWL, PLATE, LiberoEnv, Observation
-
-Floats = NDArray[np.float64]
 
 N_OFFICIAL = 50
 

@@ -8,11 +8,11 @@ from types import ModuleType
 
 import pytest
 
-from curation_ros.core.findings import FINDINGS
-from curation_ros.core.length_control import MODES
-from curation_ros.core.rules import RULES
+from curation_ros.core.decision.rules import RULES
+from curation_ros.core.decision.selection import KEEP_RULES
+from curation_ros.core.episode.findings import FINDINGS
+from curation_ros.core.evidence.length_control import MODES
 from curation_ros.core.scorers import SCORERS
-from curation_ros.core.selection import KEEP_RULES
 
 _DOCS = Path(__file__).resolve().parents[1] / "docs"
 

@@ -19,7 +19,7 @@ import pytest
 
 import curation_ros
 from curation_ros.configuration import share_file
-from curation_ros.processes import NODE_MODULES, Domain
+from curation_ros.nodes.processes import NODE_MODULES, Domain
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("curation_ros", "sim_node", "policy_node")

@@ -24,8 +24,8 @@ from curation_ros.bags.cdr_paths import ValuePath, resolve_path
 from curation_ros.bags.cdr_walk import SIZES, Leaf, Walk, least_sizes
 from curation_ros.bags.definitions import TEXTS, Definitions, full_type_name, parse_definition
 from curation_ros.bags.schemas import message_schema
+from curation_ros.core.episode.stream import Columns, Messages, rows_at
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.stream import Columns, Messages, rows_at
 
 _HEADER_TYPE = "std_msgs/msg/Header"
 _TEXT_CODES = frozenset(TEXTS.values())
@@ -111,7 +111,7 @@ def _width(length: int) -> int:
 
 
 class CdrDecoder:
-    """Decodes CDR (XCDR1, either byte order), as `curation_ros.core.stream.Decoder` asks.
+    """Decodes CDR (XCDR1, either byte order), as `curation_ros.core.episode.stream.Decoder` asks.
 
     Bytes after the last member are ignored: Fast-CDR pads there.
     """

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from curation_ros.bags.cdr_paths import Keyed, Named, ValuePath
 from curation_ros.bags.cdr_walk import SIZES, Walk
 from curation_ros.bags.definitions import PRIMITIVES, TEXTS, Field
-from curation_ros.core.stream import Messages, Stamps, rows_at
+from curation_ros.core.episode.stream import Messages, Stamps, rows_at
 
 #: A place or length in bytes: the same in all messages, or (n,) one a message.
 _Place: TypeAlias = int | Stamps

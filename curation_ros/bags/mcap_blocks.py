@@ -33,8 +33,8 @@ from curation_ros.bags.mcap_file import (
     unpack_chunk,
     walk,
 )
+from curation_ros.core.episode.stream import Messages, rows_at
 from curation_ros.core.errors import BagError
-from curation_ros.core.stream import Messages, rows_at
 
 #: Head of a message index with its opcode and length: channel, bytes of its entries.
 _MESSAGE_INDEX = struct.Struct("<BQHI")

@@ -31,13 +31,18 @@ from curation_ros.bags.mcap_file import (
 from curation_ros.bags.recovery import custom_data_of
 from curation_ros.bags.writer import own_metadata
 from curation_ros.bags.yaml_text import MOST_BYTES, load_yaml
-from curation_ros.core.builder import EpisodeBuilder
-from curation_ros.core.episode import Episode
+from curation_ros.core.episode.builder import EpisodeBuilder
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.identity import foreign_episode_id
+from curation_ros.core.episode.status import (
+    EpisodeEvent,
+    EventKind,
+    event_from_json,
+    owner_findings,
+)
+from curation_ros.core.episode.stream import Sample, SampleBlock, Stamps, header_stamps_ns
+from curation_ros.core.episode.topic_map import TopicMap, topic_map_from_json
 from curation_ros.core.errors import BagError, ConfigError, EpisodeError
-from curation_ros.core.identity import foreign_episode_id
-from curation_ros.core.status import EpisodeEvent, EventKind, event_from_json, owner_findings
-from curation_ros.core.stream import Sample, SampleBlock, Stamps, header_stamps_ns
-from curation_ros.core.topic_map import TopicMap, topic_map_from_json
 
 _FEW = 3
 _UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")

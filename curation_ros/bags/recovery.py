@@ -13,9 +13,10 @@ from curation_ros.bags.definitions import full_type_name
 from curation_ros.bags.mcap_file import Message, TornFileError, walk
 from curation_ros.bags.qos import qos_from_yaml
 from curation_ros.bags.schemas import MessageSchema
-from curation_ros.bags.writer import BagWriter, sync_folder
+from curation_ros.bags.writer import BagWriter
 from curation_ros.bags.yaml_text import load_yaml
 from curation_ros.core.errors import BagError
+from curation_ros.files import sync_folder
 
 #: What the tail of a file is called that has nothing wrong with it.
 COMPLETE = "complete"

@@ -20,6 +20,7 @@ from curation_ros.bags.qos import QosProfile, qos_to_yaml
 from curation_ros.bags.schemas import MessageSchema, message_schema
 from curation_ros.bags.yaml_text import dump_yaml
 from curation_ros.core.errors import BagError
+from curation_ros.files import sync_folder
 
 #: Bytes of messages after which a chunk is written without being asked to flush.
 CHUNK_BYTES = 256 * 1024
@@ -347,16 +348,3 @@ def own_metadata(
         "file": file_name,
         "metadata_sha256": hashlib.sha256(metadata_file).hexdigest(),
     }
-
-
-def sync_folder(folder: Path) -> None:
-    """Make new and renamed entries of a folder survive a loss of power.
-
-    Raises:
-        OSError: if the folder cannot be opened or synchronised.
-    """
-    fd = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

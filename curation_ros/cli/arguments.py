@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from curation_ros.workers import BACKENDS
+from curation_ros.batch.workers import BACKENDS
 
 
 def add_reference(parser: argparse.ArgumentParser) -> None:

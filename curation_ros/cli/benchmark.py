@@ -12,7 +12,7 @@ from curation_ros.cli.arguments import add_workers
 from curation_ros.cli.output import print_json, progress_console, say, warn
 from curation_ros.configuration import share_file
 from curation_ros.core.errors import CurationError
-from curation_ros.dataset import named_errors, write_atomically
+from curation_ros.files import named_errors, write_atomically
 
 _DONE, _NOTHING = 0, 3
 #: Problems that are shown; `results.json` has all of them.

@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a row an episode as it is done, then how many there are."""
-    from curation_ros.collecting import Collection, collect
+    from curation_ros.study.collect import Collection, collect
 
     collection = Collection(
         episodes=args.episodes,

@@ -30,14 +30,14 @@ from scipy.stats import fisher_exact
 
 from curation_ros.bags.reader import read_episode
 from curation_ros.cli.output import VERDICT_STYLE, console, percent, print_json
+from curation_ros.core.decision.selection import Manifest
+from curation_ros.core.episode.status import EpisodeEvent, Status
 from curation_ros.core.errors import CurationError
-from curation_ros.core.selection import Manifest
-from curation_ros.core.status import EpisodeEvent, Status
-from curation_ros.core.stream import NS_PER_S
-from curation_ros.dataset import Dataset
-from curation_ros.evaluating import evaluate_on_graph, summary
-from curation_ros.processes import Domain, Nodes
-from curation_ros.selecting import save_selection
+from curation_ros.core.types import NS_PER_S
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.manifests import save_selection
+from curation_ros.nodes.evaluate import evaluate_on_graph, summary
+from curation_ros.nodes.processes import Domain, Nodes
 
 # None of the starts that this seed generates is an official one.
 _DEMONSTRATION_SEED, _TRAINING_SEED = 7, 0

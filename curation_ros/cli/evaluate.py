@@ -9,12 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from curation_ros.batch.workers import spread
 from curation_ros.cli.arguments import add_workers
 from curation_ros.cli.output import percent, print_json, progress_console, say
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.errors import ConfigError
-from curation_ros.evaluating import evaluate_on_graph, summary
-from curation_ros.workers import spread
+from curation_ros.nodes.evaluate import evaluate_on_graph, summary
 
 _MOST_STEPS = 100_000  # as the sim node has it
 
@@ -70,7 +70,7 @@ def _rollouts(args: argparse.Namespace, policy: Any) -> Iterator[dict[str, Any]]
         if args.logs is None:  # after an error they stay: the message names them
             shutil.rmtree(logs, ignore_errors=True)
         return
-    from curation_ros.judging import roll_policy
+    from curation_ros.study.units import roll_policy
     from sim_node.starts import start_names
 
     tasks = [(args.policy, name, args.max_steps) for name in start_names(args.starts)]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from curation_ros.cli.output import print_json, say
 from curation_ros.core.errors import ConfigError
-from curation_ros.dataset import Dataset
-from curation_ros.exporting import FORMATS, export
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.export import FORMATS, export
 
 _ENDINGS = {".json": "keep-json", ".csv": "csv", ".parquet": "parquet"}
 

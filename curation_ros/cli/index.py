@@ -9,8 +9,8 @@ from rich.table import Table
 from rich.text import Text
 
 from curation_ros.cli.output import VERDICT_STYLE, console, print_json, warn
-from curation_ros.core.stream import NS_PER_S
-from curation_ros.dataset import Dataset
+from curation_ros.core.types import NS_PER_S
+from curation_ros.dataset.dataset import Dataset
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from curation_ros.cli.output import print_json, say
 from curation_ros.core.errors import ConfigError
-from curation_ros.curating import OVERRIDES, override
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.live.curator import OVERRIDES, override
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,21 +16,21 @@ from rich.table import Table
 from rich.text import Text
 
 from curation_ros.bags.reader import find_bags
+from curation_ros.batch.examine import EpisodesOf, Examined, Examiner, judge_bags
 from curation_ros.cli.arguments import add_config, add_reference, add_workers
 from curation_ros.cli.output import VERDICT_STYLE, console, print_json, progress_console, warn
 from curation_ros.configuration import read_curation, read_reference, share_file
-from curation_ros.core.decisions import CURATOR, VERDICTS, Decision, in_force
+from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.decision import CURATOR, VERDICTS, Decision, in_force
+from curation_ros.core.decision.examination import Examination
+from curation_ros.core.decision.rules import RULES, NoRule
+from curation_ros.core.decision.selection import TieKey
+from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.errors import ConfigError, CurationError
-from curation_ros.core.examination import Examination
-from curation_ros.core.rules import RULES, NoRule
 from curation_ros.core.scorers import SCORERS
-from curation_ros.core.scoring import Curation
-from curation_ros.core.selection import TieKey
-from curation_ros.core.stream import NS_PER_S
-from curation_ros.core.topic_map import read_topic_map
-from curation_ros.curating import log_decision
-from curation_ros.dataset import Dataset
-from curation_ros.examining import EpisodesOf, Examined, Examiner, judge_bags
+from curation_ros.core.types import NS_PER_S
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.live.curator import log_decision
 
 _DONE, _FINDINGS, _NOTHING = 0, 1, 3
 _FIXED_WIDTH, _SCORE_WIDTH = 64, 12

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 
 from curation_ros.cli.output import print_json, say, warn
-from curation_ros.core.selection import KEEP_RULES
-from curation_ros.dataset import Dataset
-from curation_ros.selecting import save_selection
+from curation_ros.core.decision.selection import KEEP_RULES
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.manifests import save_selection
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

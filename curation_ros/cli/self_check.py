@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from curation_ros.batch.self_check import self_check
 from curation_ros.cli.arguments import add_config, add_reference
 from curation_ros.cli.output import print_json, say
 from curation_ros.configuration import read_curation, share_file
+from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.scorers import SCORERS
-from curation_ros.core.topic_map import read_topic_map
-from curation_ros.dataset import Dataset
-from curation_ros.self_checking import self_check
+from curation_ros.dataset.dataset import Dataset
 
 _PROVEN, _DIFFERS = 0, 1
 

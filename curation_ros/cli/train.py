@@ -10,7 +10,7 @@ from rich.progress import Progress
 
 from curation_ros.cli.output import print_json, progress_console, say
 from curation_ros.core.errors import ConfigError
-from curation_ros.selecting import read_manifest, read_selected
+from curation_ros.dataset.manifests import read_manifest, read_selected
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

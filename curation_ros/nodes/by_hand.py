@@ -10,12 +10,12 @@ from dataclasses import replace
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
-from curation_ros.core.identity import new_episode_id
-from curation_ros.core.status import EpisodeEvent, event_to_status
+from curation_ros.core.episode.identity import new_episode_id
+from curation_ros.core.episode.status import EpisodeEvent, event_to_status
+from curation_ros.live.recorder import Notice, Recording
 from curation_ros.nodes.delivery import deliver
 from curation_ros.nodes.messages import array_to_ros
 from curation_ros.nodes.qos import LATCHED
-from curation_ros.recording import Notice, Recording
 
 #: Whether a request was granted, and what to answer.
 Answer = tuple[bool, str]

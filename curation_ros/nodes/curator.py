@@ -20,24 +20,24 @@ from curation_ros.configuration import (
     share_file,
     topic_map_or_default,
 )
-from curation_ros.core.decisions import Decision
-from curation_ros.core.errors import CurationError
-from curation_ros.core.status import (
+from curation_ros.core.decision.decision import Decision
+from curation_ros.core.episode.status import (
     alert_to_status,
     counts_to_values,
     decision_to_status,
     event_from_status,
 )
-from curation_ros.core.stream import Sample
-from curation_ros.curating import Decided, LiveCuration
-from curation_ros.dataset import Dataset
+from curation_ros.core.episode.stream import Sample
+from curation_ros.core.errors import CurationError
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.manifests import save_selection
+from curation_ros.live.curator import Decided, LiveCuration
 from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import single_from_ros, status_to_ros
 from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import DECISIONS, DRAIN_S, EVENTS, LATCHED
 from curation_ros.nodes.spinning import run, take_waiting
 from curation_ros.nodes.subscriptions import MappedSubscriptions
-from curation_ros.selecting import save_selection
 
 PARAMETERS = (
     Parameter("dataset", "dataset", "dataset whose episodes are decided", needed=True),

@@ -8,7 +8,7 @@ from typing import Any
 
 from rclpy.duration import Duration
 
-from curation_ros.core.stream import NS_PER_S
+from curation_ros.core.types import NS_PER_S
 
 # Fast DDS asks for acknowledgements every 3 s; who was killed never answers.
 _PATIENCE_S = 4.0

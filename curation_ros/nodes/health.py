@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
-from curation_ros.core.status import ERROR, OK, Status
+from curation_ros.core.episode.status import ERROR, OK, Status
 from curation_ros.nodes.messages import array_to_ros
 from curation_ros.nodes.qos import EVENTS
 

@@ -1,4 +1,4 @@
-"""Plain data to ROS messages and back; the keys themselves live in `curation_ros.core.status`."""
+"""Plain data to ROS messages and back; the keys themselves live in `curation_ros.core.episode.status`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from sensor_msgs.msg import JointState
 
+from curation_ros.core.episode.status import Status
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.status import Status
-from curation_ros.core.stream import NS_PER_S
+from curation_ros.core.types import NS_PER_S
 
 _FRAME = "world"
 

@@ -11,16 +11,17 @@ from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 from curation_ros.configuration import topic_map_or_default
-from curation_ros.core.errors import CurationError
-from curation_ros.core.status import (
+from curation_ros.core.episode.status import (
     ERROR,
     OK,
     Status,
     counts_to_values,
     event_from_status,
 )
-from curation_ros.core.stream import Sample
-from curation_ros.dataset import Dataset
+from curation_ros.core.episode.stream import Sample
+from curation_ros.core.errors import CurationError
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.live.recorder import Notice, RecordedTopic, Recording, recover_partials
 from curation_ros.nodes.by_hand import Answer, ByHand
 from curation_ros.nodes.delivery import deliver
 from curation_ros.nodes.health import Health
@@ -29,7 +30,6 @@ from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import DRAIN_S, EVENTS, LATCHED
 from curation_ros.nodes.spinning import run, take_all, take_arrived
 from curation_ros.nodes.subscriptions import MappedSubscriptions
-from curation_ros.recording import Notice, RecordedTopic, Recording, recover_partials
 
 PARAMETERS = (
     Parameter("dataset", "dataset", "folder of the bags; made where there is none", needed=True),

@@ -13,9 +13,15 @@ from rclpy.node import Node
 
 from curation_ros.bags.reader import Bag, episode_event, find_bags, open_bag
 from curation_ros.configuration import topic_map_or_default
+from curation_ros.core.episode.status import (
+    EpisodeEvent,
+    Status,
+    counts_from_status,
+    event_to_status,
+)
+from curation_ros.core.episode.stream import Sample, playback_order
 from curation_ros.core.errors import ConfigError, CurationError
-from curation_ros.core.status import EpisodeEvent, Status, counts_from_status, event_to_status
-from curation_ros.core.stream import NS_PER_S, Sample, playback_order
+from curation_ros.core.types import NS_PER_S
 from curation_ros.nodes.matching import Matching
 from curation_ros.nodes.messages import array_to_ros, status_from_ros
 from curation_ros.nodes.parameters import Parameter, declare

@@ -10,9 +10,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from curation_ros.bags.qos import QosProfile
+from curation_ros.core.episode.stream import Sample, header_stamp_ns
+from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import ConfigError, EpisodeError
-from curation_ros.core.stream import Sample, header_stamp_ns
-from curation_ros.core.topic_map import TopicMap
 from curation_ros.nodes.health import publishers_found
 from curation_ros.nodes.qos import MAPPED
 

@@ -13,8 +13,8 @@ import rclpy.context
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 
+from curation_ros.core.episode.status import EpisodeEvent, Status, event_from_status
 from curation_ros.core.errors import CurationError
-from curation_ros.core.status import EpisodeEvent, Status, event_from_status
 from curation_ros.nodes.messages import single_from_ros
 from curation_ros.nodes.qos import DECISIONS, EVENTS, LATCHED
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from curation_ros.core.errors import CurationError
-from curation_ros.dataset import named_errors, write_atomically
+from curation_ros.files import named_errors, write_atomically
 from curation_ros.reporting.findings import check, read_results
 from curation_ros.reporting.html import html
 from curation_ros.reporting.markdown import markdown

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MultipleLocator, PercentFormatter
 
-from curation_ros.core.phases import PHASES
+from curation_ros.core.episode.phases import PHASES
 from curation_ros.reporting import published
 from curation_ros.reporting.blocks import Figure, Panel
 from curation_ros.reporting.findings import Row, at_keep, draws, is_plain, named

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from curation_ros.core.errors import ConfigError
-from curation_ros.dataset import named_errors
+from curation_ros.files import named_errors
 from curation_ros.study.plan import parse_row
 
 #: Of `results.json`; see `curation_ros.study.results.FORMAT`, which needs a simulator to import.

@@ -1,14 +1,14 @@
 """Values of the paper that a report sets its own beside.
 
 Source: Bedi, What Demonstration Curation Metrics Do to Your Policy, arXiv 2606.10229, 2026,
-Tables I and II. Table I stands in `curation_ros.auditing.PAPER`, and so in `results.json`.
+Tables I and II. Table I stands in `curation_ros.batch.audit.PAPER`, and so in `results.json`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from curation_ros.auditing import PAPER
+from curation_ros.batch.audit import PAPER
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from curation_ros.configuration import topic_map_or_default
-from curation_ros.core.balance import LEAST_SHARE
-from curation_ros.core.decisions import VERDICTS, Decision
-from curation_ros.core.episode import Episode
+from curation_ros.core.decision.balance import LEAST_SHARE
+from curation_ros.core.decision.decision import VERDICTS, Decision
+from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.reporting import figures, tables
 from curation_ros.reporting.blocks import Block, Figure, Points, Table, Text

@@ -12,18 +12,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from curation_ros.core.carrying import carrying_of
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.gripper import commanded
-from curation_ros.core.stream import NS_PER_S
+from curation_ros.core.evidence.carrying import carrying_of
+from curation_ros.core.evidence.gripper import commanded
+from curation_ros.core.types import NS_PER_S
 from curation_ros.reporting.blocks import Figure
 from curation_ros.reporting.figures import RC, Drawing, figure, spoken
 
 if TYPE_CHECKING:
-    from curation_ros.core.decisions import Decision
-    from curation_ros.core.episode import Episode
-    from curation_ros.core.gripper import Mask
-    from curation_ros.core.stream import Floats
+    from curation_ros.core.decision.decision import Decision
+    from curation_ros.core.episode.episode import Episode
+    from curation_ros.core.types import Floats, Mask
 
 #: Okabe and Ito's, as in the figures of a report.
 _OBJECT, _EFFECTOR, _KEPT, _BROKE = "#0072B2", "#767676", "#009E73", "#D55E00"

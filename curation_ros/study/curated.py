@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from curation_ros.core.balance import balance_of, phase_steps
-from curation_ros.core.decisions import VERDICTS, Decision
-from curation_ros.core.episode import Episode
-from curation_ros.core.examination import Span
-from curation_ros.core.salvage import good_prefix
+from curation_ros.core.decision.balance import balance_of, phase_steps
+from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.decision import VERDICTS, Decision
+from curation_ros.core.decision.salvage import good_prefix
+from curation_ros.core.episode.episode import Episode
 from curation_ros.core.scorers import SCORERS
-from curation_ros.core.scoring import Curation
+from curation_ros.core.types import Span
 
 Row = dict[str, Any]
 

@@ -180,7 +180,7 @@ class StudyPlan:
         max_steps: most commands of a rollout.
         gives_up: end a rollout that is as good as lost, see `policy_node.rollouts.GiveUp`.
         gradient_steps: of each training.
-        length: length control of the scorers, see `curation_ros.auditing.LENGTHS`.
+        length: length control of the scorers, see `curation_ros.batch.audit.LENGTHS`.
         length_value: its value.
         scorers: audited, and ranked by.
         keep_for_audit: how many the audit's table keeps.

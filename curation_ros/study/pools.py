@@ -14,15 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from curation_ros.auditing import AuditSettings, audit, read_episodes, read_labels
-from curation_ros.core.episode import Episode
+from curation_ros.batch.audit import AuditSettings, audit, read_episodes, read_labels
+from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.selection import ranking, tie_key
+from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError, EpisodeError
-from curation_ros.core.examination import Span
 from curation_ros.core.scorers import SCORERS
-from curation_ros.core.scoring import Curation
-from curation_ros.core.selection import ranking, tie_key
-from curation_ros.core.stream import Floats
-from curation_ros.dataset import Dataset
+from curation_ros.core.types import Floats, Span
+from curation_ros.dataset.dataset import Dataset
 from curation_ros.study.curated import (
     Curated,
     curate,
@@ -33,7 +32,7 @@ from curation_ros.study.curated import (
 from curation_ros.study.plan import CONTROLS, DECIDED, StudyPlan, Term, parse_row
 
 if TYPE_CHECKING:
-    from curation_ros.collecting import Collection
+    from curation_ros.study.collect import Collection
 
 #: Points that a phase of a trace is resampled to.
 POINTS_PER_PHASE = 8
@@ -115,7 +114,7 @@ def collect_datasets(
         ConfigError: if a start state is used twice among them and the rollouts.
         CurationError: if one of them cannot be completed.
     """
-    from curation_ros.collecting import collect
+    from curation_ros.study.collect import collect
 
     check_starts(plan)
     made, n_new = {}, 0
@@ -163,7 +162,7 @@ def check_starts(plan: StudyPlan) -> None:
 
 
 def _collection(settings: Any, name: str) -> Collection:
-    from curation_ros.collecting import Collection
+    from curation_ros.study.collect import Collection
 
     try:
         return Collection(**settings)

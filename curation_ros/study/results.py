@@ -11,12 +11,12 @@ from statistics import mean
 from typing import Any
 
 from curation_ros import __version__
-from curation_ros.core import policy_statistics as stats
-from curation_ros.core.episode import Episode
+from curation_ros.core.episode.episode import Episode
 from curation_ros.core.scorers import SCORERS
-from curation_ros.judging import Row
+from curation_ros.core.statistics import policy_statistics as stats
 from curation_ros.study.plan import Contrast, Stage, StudyPlan, parse_row
 from curation_ros.study.running import Cell, Study
+from curation_ros.study.units import Row
 
 #: Raised when a key changes its meaning.
 FORMAT = 1

@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from curation_ros.auditing import read_episodes
-from curation_ros.core.episode import Episode
+from curation_ros.batch.audit import read_episodes
+from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import CurationError
-from curation_ros.dataset import Dataset, append_line, named_errors, read_lines
-from curation_ros.judging import Judge, PolicyUnit, RolloutUnit, Row, Work
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.files import append_line, named_errors, read_lines
 from curation_ros.study.curated import phases_alone
 from curation_ros.study.plan import Stage, StudyPlan, parse_row
 from curation_ros.study.pools import (
@@ -23,6 +23,7 @@ from curation_ros.study.pools import (
     score_pool,
     training_set,
 )
+from curation_ros.study.units import Judge, PolicyUnit, RolloutUnit, Row, Work
 
 Said = Callable[[str], None]
 #: What is told of a unit that was done: which stage, what kind, how many of how many.

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 
 @pytest.fixture

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from scenes import LIFT_AT, RELEASE_AT, scene
 
-from curation_ros.auditing import PAPER
-from curation_ros.core import detection
-from curation_ros.core.episode import Episode
-from curation_ros.dataset import Dataset
-from curation_ros.judging import Judge
+from curation_ros.batch.audit import PAPER
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.statistics import detection
+from curation_ros.dataset.dataset import Dataset
 from curation_ros.study.curated import curate, facts_of, phases_alone
 from curation_ros.study.plan import DECIDED, StudyPlan, plan_from
 from curation_ros.study.pools import POINTS_PER_PHASE, Pool, training_set
 from curation_ros.study.results import results
 from curation_ros.study.running import Cell, Study
+from curation_ros.study.units import Judge
 from sim_node.starts import start_names
 
 N_POINTS = 6 * POINTS_PER_PHASE

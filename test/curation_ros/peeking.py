@@ -5,9 +5,9 @@ from __future__ import annotations
 import inspect
 from pathlib import Path
 
-from curation_ros.core.episode import Episode
+from curation_ros.core.episode.episode import Episode
 from curation_ros.core.scorers import Scorer
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 
 class Peeker(Scorer):

@@ -16,12 +16,12 @@ import numpy as np
 from episodes import make_episode, topic_map
 
 from curation_ros.bags import QosProfile
-from curation_ros.core.episode import Episode
-from curation_ros.core.status import EpisodeEvent
-from curation_ros.core.stream import Sample
-from curation_ros.core.topic_map import TopicMap
-from curation_ros.dataset import Dataset
-from curation_ros.recording import Notice, RecordedTopic, Recording
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.status import EpisodeEvent
+from curation_ros.core.episode.stream import Sample
+from curation_ros.core.episode.topic_map import TopicMap
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.live.recorder import Notice, RecordedTopic, Recording
 
 #: From a stamp to its message's arrival.
 DELAY_NS = 2_000_000

@@ -15,12 +15,12 @@ from curation_ros.configuration import (
     share_file,
     topic_map_or_default,
 )
+from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.rules import RULES
+from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.errors import BagError, ConfigError
-from curation_ros.core.rules import RULES
 from curation_ros.core.scorers import DEFAULT_SCORERS
-from curation_ros.core.scoring import Curation
-from curation_ros.core.topic_map import read_topic_map
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 ROOT = Path(__file__).resolve().parents[2]
 

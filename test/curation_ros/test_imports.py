@@ -8,7 +8,7 @@ from pathlib import Path
 from episodes import make_episode
 from streams import record
 
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 ROOT = Path(__file__).resolve().parents[2]
 _BLOCK = """
@@ -52,7 +52,7 @@ def _run(code: str, blocked: str, *arguments: object) -> subprocess.CompletedPro
 def test_core_imports_without_ros_simulator_torch_and_bags() -> None:
     done = _run(_IMPORT_ALL, f"{ROBOTICS},mcap,rosbags,rich,safetensors,curation_ros.bags")
     assert done.returncode == 0, done.stderr
-    modules = {f"curation_ros.core.{p.stem}" for p in (ROOT / "curation_ros/core").glob("*.py")}
+    modules = {f"curation_ros.core.{p.stem}" for p in (ROOT / "curation_ros/core").rglob("*.py")}
     assert modules - {"curation_ros.core.__init__"} <= set(done.stdout.split())
 
 

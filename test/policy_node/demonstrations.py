@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from curation_ros.core.episode import Episode
-from curation_ros.core.topic_map import TopicMap, read_topic_map
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.topic_map import TopicMap, read_topic_map
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 50_000_000

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from demonstrations import PERIOD_NS, TOPIC_MAP, demonstration
 
+from curation_ros.core.episode.topic_map import topic_map_from_json
 from curation_ros.core.errors import PolicyError
-from curation_ros.core.topic_map import topic_map_from_json
 from policy_node.observation import VARIANTS
 from policy_node.policy import Policy
 

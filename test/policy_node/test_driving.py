@@ -22,16 +22,16 @@ from pausing import PAUSE, RESUME, pausable
 
 from curation_ros.bags.reader import read_episode
 from curation_ros.cli.main import main as curation
-from curation_ros.core.episode import Episode
-from curation_ros.core.phases import PHASES
-from curation_ros.core.status import EpisodeEvent
-from curation_ros.dataset import Dataset
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.phases import PHASES
+from curation_ros.core.episode.status import EpisodeEvent
+from curation_ros.dataset.dataset import Dataset
 
 pytestmark = [pytest.mark.ros, pytest.mark.sim, pytest.mark.policy]
 pytest.importorskip("libero", reason="LIBERO is not installed")
 pytest.importorskip("torch", reason="torch is not installed")
 
-from curation_ros.collecting import Collection, collect  # noqa: E402 - needs LIBERO
+from curation_ros.study.collect import Collection, collect  # noqa: E402 - needs LIBERO
 from policy_node.policy import Policy  # noqa: E402 - needs safetensors
 from policy_node.rollouts import SimController, field_values  # noqa: E402 - needs LIBERO
 from policy_node.train import train  # noqa: E402 - needs torch

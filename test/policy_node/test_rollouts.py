@@ -7,7 +7,7 @@ import pytest
 from demonstrations import TOPIC_MAP
 from test_policy import policy
 
-from curation_ros.core.phases import PHASES
+from curation_ros.core.episode.phases import PHASES
 
 pytestmark = pytest.mark.sim
 pytest.importorskip("mujoco")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from demonstrations import PERIOD_NS, TOPIC_MAP, demonstration, step_values
 
+from curation_ros.core.episode.topic_map import topic_map_from_json
 from curation_ros.core.errors import PolicyError
-from curation_ros.core.topic_map import topic_map_from_json
 from policy_node.controller import PolicyController
 from policy_node.observation import VARIANTS, ObservationSpec
 from policy_node.policy import Policy, standardise

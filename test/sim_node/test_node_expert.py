@@ -9,7 +9,7 @@ from commander import COMMANDS
 from robot import Robot
 
 from curation_ros.bags.reader import open_bag, read_episode
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 pytestmark = [pytest.mark.ros, pytest.mark.sim]
 pytest.importorskip("libero", reason="LIBERO is not installed")

@@ -13,7 +13,7 @@ from graph import LATCHED, MAPPED, DiagnosticArray, PoseStamped, Trigger
 from robot import stamp_ns
 
 from curation_ros.bags.reader import read_episode
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 pytestmark = [pytest.mark.ros, pytest.mark.sim]
 pytest.importorskip("libero", reason="LIBERO is not installed")

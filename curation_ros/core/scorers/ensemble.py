@@ -15,8 +15,8 @@ from curation_ros.core.scorers.smoothness import Smoothness
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from curation_ros.core.episode import Episode
-    from curation_ros.core.stream import Floats
+    from curation_ros.core.episode.episode import Episode
+    from curation_ros.core.types import Floats
 
 
 class Ensemble(Scorer):

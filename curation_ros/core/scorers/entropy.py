@@ -8,7 +8,7 @@ from curation_ros.core.scorers.features import moving_action
 from curation_ros.core.scorers.scorer import Scorer
 
 if TYPE_CHECKING:
-    from curation_ros.core.episode import Episode
+    from curation_ros.core.episode.episode import Episode
 
 
 class Entropy(Scorer):

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from curation_ros.core import gripper
 from curation_ros.core.errors import EpisodeError
+from curation_ros.core.evidence import gripper
 from curation_ros.core.scorers.scorer import Abstain
 
 if TYPE_CHECKING:
-    from curation_ros.core.episode import Episode
-    from curation_ros.core.stream import Floats
+    from curation_ros.core.episode.episode import Episode
+    from curation_ros.core.types import Floats
 
 
 def _columns(episode: Episode, names: tuple[str, ...], what: str) -> Floats:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from curation_ros.core.carrying import Carrying
 from curation_ros.core.errors import ConfigError
-from curation_ros.core.grip import grip_of
+from curation_ros.core.evidence.carrying import Carrying
+from curation_ros.core.evidence.fingers import grip_of
 from curation_ros.core.scorers.features import checked_command
 from curation_ros.core.scorers.object_coupling import (
     known,
@@ -17,7 +17,7 @@ from curation_ros.core.scorers.object_coupling import (
 from curation_ros.core.scorers.scorer import Scorer
 
 if TYPE_CHECKING:
-    from curation_ros.core.episode import Episode
+    from curation_ros.core.episode.episode import Episode
 
 
 class GripConsistency(Scorer):

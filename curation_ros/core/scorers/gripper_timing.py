@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from curation_ros.core import gripper
 from curation_ros.core.errors import EpisodeError
+from curation_ros.core.evidence import gripper
 from curation_ros.core.scorers.features import checked_command, phase_name
 from curation_ros.core.scorers.scorer import Abstain, Scorer
-from curation_ros.core.stream import NS_PER_S
+from curation_ros.core.types import NS_PER_S
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from curation_ros.core.episode import Episode
+    from curation_ros.core.episode.episode import Episode
 
 
 class GripperTiming(Scorer):

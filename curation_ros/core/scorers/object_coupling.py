@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from curation_ros.core.carrying import Carrying, Hold, carry_labels, carrying_of
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.gripper import commanded
+from curation_ros.core.evidence.carrying import Carrying, Hold, carry_labels, carrying_of
+from curation_ros.core.evidence.gripper import commanded
 from curation_ros.core.scorers.features import checked_command
 from curation_ros.core.scorers.scorer import Abstain, Scorer
-from curation_ros.core.stream import NS_PER_S
+from curation_ros.core.types import NS_PER_S
 
 if TYPE_CHECKING:
-    from curation_ros.core.episode import Episode
+    from curation_ros.core.episode.episode import Episode
 
 
 class ObjectCoupling(Scorer):

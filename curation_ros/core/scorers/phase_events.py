@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from curation_ros.core.carrying import carry_labels
 from curation_ros.core.errors import ConfigError
+from curation_ros.core.evidence.carrying import carry_labels
 from curation_ros.core.scorers.features import checked_command
 from curation_ros.core.scorers.object_coupling import seconds
 from curation_ros.core.scorers.scorer import Abstain, Scorer
 
 if TYPE_CHECKING:
-    from curation_ros.core.episode import Episode
+    from curation_ros.core.episode.episode import Episode
 
 
 class PhaseEvents(Scorer):

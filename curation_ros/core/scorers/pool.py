@@ -18,8 +18,8 @@ from curation_ros.core.scorers.scorer import Abstain, Scorer
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from curation_ros.core.episode import Episode
-    from curation_ros.core.stream import Floats
+    from curation_ros.core.episode.episode import Episode
+    from curation_ros.core.types import Floats
 
 #: Models that are learned beside the one of all episodes: more cost time and memory.
 MAX_FOLDS = 20

@@ -12,7 +12,7 @@ from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from curation_ros.core.episode import Episode
+    from curation_ros.core.episode.episode import Episode
 
 #: What orients a score; `dataset`: the unlabelled dataset itself, which only says what is usual.
 Need = Literal["nothing", "reference", "dataset", "object pose", "rollouts", "labels"]

@@ -12,8 +12,8 @@ from curation_ros.core.scorers.features import moving_action
 from curation_ros.core.scorers.scorer import Abstain, Scorer
 
 if TYPE_CHECKING:
-    from curation_ros.core.episode import Episode
-    from curation_ros.core.stream import Floats
+    from curation_ros.core.episode.episode import Episode
+    from curation_ros.core.types import Floats
 
 
 def spectral_arc_length(

@@ -21,8 +21,8 @@ from curation_ros.core.scorers.scorer import Abstain, Scorer
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from curation_ros.core.episode import Episode
-    from curation_ros.core.stream import Floats
+    from curation_ros.core.episode.episode import Episode
+    from curation_ros.core.types import Floats
 
 
 def _cosine(a: Floats, b: Floats) -> float:

@@ -27,9 +27,10 @@ from mcap.writer import Writer
 from streams import ARM, FINGERS, ended, samples_of
 
 from curation_ros.bags import BagWriter, message_schema
-from curation_ros.core.episode import Episode
-from curation_ros.core.status import EpisodeEvent, event_to_json
-from curation_ros.core.stream import NS_PER_S, Sample
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.status import EpisodeEvent, event_to_json
+from curation_ros.core.episode.stream import Sample
+from curation_ros.core.types import NS_PER_S
 
 MAGIC = b"\x89MCAP0\r\n"
 EEF, JOINTS, PHASE = "eef_pose", "joint_states", "phase"

@@ -20,11 +20,11 @@ from curation_ros.bags import find_bags, read_episode
 from curation_ros.bags.mcap_file import TornFileError
 from curation_ros.bags.yaml_text import load_yaml
 from curation_ros.cli.main import main
-from curation_ros.core.checks import Baseline, check_episode
+from curation_ros.core.decision.curation import Curation
+from curation_ros.core.episode.findings import FINDINGS
 from curation_ros.core.errors import BagError, ConfigError, CurationError, EpisodeError
-from curation_ros.core.findings import FINDINGS
-from curation_ros.core.scoring import Curation
-from curation_ros.dataset import Dataset
+from curation_ros.core.evidence.checks import Baseline, check_episode
+from curation_ros.dataset.dataset import Dataset
 
 #: Of everything that reads one bad bag; a chunk of the largest size is not among them.
 MOST_MEMORY_BYTES = 150 << 20

@@ -40,9 +40,9 @@ from curation_ros.bags import (
     recover_bag,
 )
 from curation_ros.bags.mcap_file import read_info
-from curation_ros.core.builder import EpisodeBuilder
+from curation_ros.core.episode.builder import EpisodeBuilder
+from curation_ros.core.episode.topic_map import TopicMap, topic_map_from_json
 from curation_ros.core.errors import BagError, ConfigError
-from curation_ros.core.topic_map import TopicMap, topic_map_from_json
 
 POSE_TEXT = message_schema(POSE).text.encode()
 

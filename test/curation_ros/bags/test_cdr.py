@@ -27,8 +27,8 @@ from mcap.records import Schema
 
 from curation_ros.bags.cdr import CdrDecoder, shared_decoder
 from curation_ros.bags.schemas import message_schema
+from curation_ros.core.episode.stream import Messages
 from curation_ros.core.errors import BagError, ConfigError, EpisodeError
-from curation_ros.core.stream import Messages
 
 JOINT_NAMES = [f"panda_joint{i}" for i in range(1, 8)]
 

@@ -15,7 +15,7 @@ from episodes import make_episode, make_reference
 from streams import record, samples_of
 
 from curation_ros.cli.main import main
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 #: Scorers of a kind each that are fitted in no time.
 CONFIG = "scorers: [gripper_timing, knn, length]\n"

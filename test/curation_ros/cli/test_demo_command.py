@@ -15,13 +15,18 @@ from episodes import make_episode
 from streams import record
 
 from curation_ros.cli.demo import _compared, _Demo, _lead
-from curation_ros.core.decisions import Decision
+from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.decision import Decision
+from curation_ros.core.episode.findings import Finding
+from curation_ros.core.episode.status import (
+    EpisodeEvent,
+    Status,
+    alert_to_status,
+    decision_to_status,
+)
 from curation_ros.core.errors import CurationError
-from curation_ros.core.findings import Finding
-from curation_ros.core.scoring import Curation
-from curation_ros.core.status import EpisodeEvent, Status, alert_to_status, decision_to_status
-from curation_ros.dataset import Dataset
-from curation_ros.selecting import read_manifest
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.manifests import read_manifest
 
 ALL = ("everything", "kept", "kept-and-salvaged")
 DROPS_AT = 140

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from streams import record, short_episode
 
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 DONE, USAGE, NOTHING = 0, 2, 3
 KEYS = ["episode", "name", "path", "decision", "by", "reason", "recovered"]

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from curation_ros.core.decisions import Decision
-from curation_ros.dataset import Dataset
+from curation_ros.core.decision.decision import Decision
+from curation_ros.dataset.dataset import Dataset
 
 DONE, USAGE, NOTHING = 0, 2, 3
 Run = Callable[..., Any]

@@ -13,9 +13,9 @@ import pytest
 
 from curation_ros.bags import find_bags, open_bag, read_episode
 from curation_ros.configuration import read_curation, read_reference
-from curation_ros.core.findings import FINDINGS
+from curation_ros.core.episode.findings import FINDINGS
 from curation_ros.core.scorers import DEFAULT_SCORERS
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 DONE, FOUND, USAGE, NOTHING = 0, 1, 2, 3
 KEYS = ["episode", "name", "path", "length", "scores", "decision", "reason", "span", "findings"]

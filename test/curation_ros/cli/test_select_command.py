@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from streams import record, short_episode
 
-from curation_ros.core.decisions import Decision
-from curation_ros.core.selection import KEEP_RULES
-from curation_ros.dataset import Dataset
+from curation_ros.core.decision.decision import Decision
+from curation_ros.core.decision.selection import KEEP_RULES
+from curation_ros.dataset.dataset import Dataset
 
 DONE, USAGE, NOTHING = 0, 2, 3
 Run = Callable[..., Any]

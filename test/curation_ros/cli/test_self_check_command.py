@@ -8,7 +8,7 @@ import pytest
 from peeking import Peeker
 
 from curation_ros.core.scorers import SCORERS
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 PROVEN, DIFFERS, USAGE, NOTHING = 0, 1, 2, 3
 Run = Callable[..., Any]

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from curation_ros.core.episode import Episode
-from curation_ros.core.findings import Finding
-from curation_ros.core.stream import Floats
-from curation_ros.core.topic_map import TopicMap, read_topic_map
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.findings import Finding
+from curation_ros.core.episode.topic_map import TopicMap, read_topic_map
+from curation_ros.core.types import Floats
 
 START_NS = 1_781_000_000_000_000_000
 CLOSE_AT, GRASP_STEPS, LIFT_STEPS = 95, 15, 59

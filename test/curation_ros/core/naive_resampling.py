@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
-from curation_ros.core.topic_map import FieldSpec, TopicMap
+from curation_ros.core.episode.topic_map import FieldSpec, TopicMap
 
 #: Stamp and columns of one message.
 Row: TypeAlias = tuple[int, Sequence[float]]

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from episodes import START_NS, topic_map
 
-from curation_ros.core.episode import Episode
-from curation_ros.core.stream import Floats
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.types import Floats
 
 RATE_HZ = 20
 APPROACH, GRASP, LIFT, TRANSPORT, RELEASE = 40, 15, 50, 60, 20

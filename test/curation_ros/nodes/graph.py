@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 from pausing import PAUSE, RESUME, stands_still
 
-from curation_ros.core.decisions import Decision
+from curation_ros.core.decision.decision import Decision
+from curation_ros.core.episode.status import EpisodeEvent, Status, event_from_status
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.status import EpisodeEvent, Status, event_from_status
-from curation_ros.dataset import Dataset
-from curation_ros.processes import Domain, Nodes
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.nodes.processes import Domain, Nodes
 
 try:
     import rclpy

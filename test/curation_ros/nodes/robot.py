@@ -18,11 +18,11 @@ import pytest
 from episodes import make_episode, topic_map
 from graph import Graph
 
-from curation_ros.core.episode import Episode
-from curation_ros.core.identity import new_episode_id
-from curation_ros.core.status import EpisodeEvent, event_to_status, phase_to_status
-from curation_ros.core.stream import NS_PER_S
-from curation_ros.core.topic_map import TopicMap
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.identity import new_episode_id
+from curation_ros.core.episode.status import EpisodeEvent, event_to_status, phase_to_status
+from curation_ros.core.episode.topic_map import TopicMap
+from curation_ros.core.types import NS_PER_S
 
 try:
     from geometry_msgs.msg import Vector3

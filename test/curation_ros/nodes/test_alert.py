@@ -10,8 +10,8 @@ from episodes import topic_map
 from graph import DiagnosticArray
 from robot import BOWL, PLATE, Robot, libero_take, without
 
-from curation_ros.core.status import Status
-from curation_ros.dataset import Dataset
+from curation_ros.core.episode.status import Status
+from curation_ros.dataset.dataset import Dataset
 from curation_ros.nodes.messages import single_from_ros
 from curation_ros.nodes.qos import EVENTS
 

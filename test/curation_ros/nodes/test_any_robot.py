@@ -13,8 +13,8 @@ from robot import N_STEPS, PERIOD_NS, Robot, make_take, new_start_ns, other_robo
 
 from curation_ros.bags.reader import open_bag, read_episode
 from curation_ros.cli.main import main as curation
-from curation_ros.core.topic_map import topic_map_from_json
-from curation_ros.dataset import Dataset
+from curation_ros.core.episode.topic_map import topic_map_from_json
+from curation_ros.dataset.dataset import Dataset
 
 pytestmark = pytest.mark.ros
 

@@ -10,8 +10,8 @@ from graph import DECISIONS, DiagnosticArray, KeyValue
 from robot import Robot, libero_take
 from std_srvs.srv import Trigger
 
-from curation_ros.core.status import scores_from_status
-from curation_ros.dataset import Dataset
+from curation_ros.core.episode.status import scores_from_status
+from curation_ros.dataset.dataset import Dataset
 
 pytestmark = pytest.mark.ros
 

@@ -9,7 +9,7 @@ import pytest
 from robot import Robot, libero_take
 from std_srvs.srv import Trigger
 
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 pytestmark = pytest.mark.ros
 

@@ -10,7 +10,7 @@ import pytest
 from episodes import topic_map
 from robot import PLATE, Robot, libero_take, without
 
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 pytestmark = pytest.mark.ros
 

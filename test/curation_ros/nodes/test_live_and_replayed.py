@@ -26,7 +26,7 @@ from robot import (
 )
 
 from curation_ros.cli.main import main as curation
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 pytestmark = pytest.mark.ros
 

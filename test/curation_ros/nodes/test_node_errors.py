@@ -13,7 +13,7 @@ import yaml
 from episodes import topic_map
 from graph import Graph
 
-from curation_ros.processes import NODE_MODULES, node_arguments
+from curation_ros.nodes.processes import NODE_MODULES, node_arguments
 
 pytestmark = pytest.mark.ros
 

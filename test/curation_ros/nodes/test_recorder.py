@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from curation_ros.bags.mcap_file import Message, TornFileError, walk
 from curation_ros.bags.reader import open_bag, read_episode
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 pytestmark = pytest.mark.ros
 

@@ -14,7 +14,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from curation_ros.bags.reader import open_bag, read_episode
 from curation_ros.cli.main import main as curation
-from curation_ros.dataset import Dataset
+from curation_ros.dataset.dataset import Dataset
 
 pytestmark = pytest.mark.ros
 

@@ -1,0 +1,1 @@
+"""Work over many episodes: examine, score, audit, self-check."""

@@ -1,0 +1,328 @@
+"""Many bags to examinations: spread over workers, kept in the index, taken up where it stopped.
+
+An examination is a function of a bag and of the fitted scorers; it is computed once and kept in
+the index of the dataset (or, for a folder of bags that is none, in the user's cache) under the
+hash of both. What rules and decisions make of it costs next to nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from curation_ros import __version__
+from curation_ros.bags.reader import read_episode
+from curation_ros.batch.workers import WorkerDiedError, check_workers, spread
+from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.decision import Decision, untrustworthy
+from curation_ros.core.decision.examination import Examination
+from curation_ros.core.decision.judgement import Ruling
+from curation_ros.core.decision.selection import TieKey
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.findings import Finding
+from curation_ros.core.episode.topic_map import TopicMap
+from curation_ros.core.errors import CurationError
+from curation_ros.dataset.index import Index
+
+# Bags that a worker gets at once: a fitted curation of some 100 kB goes with them.
+_BATCH = 16
+
+
+@dataclass(frozen=True)
+class Examined:
+    """A bag and what was seen in it.
+
+    Attributes:
+        path: the bag.
+        result: what was seen, or why it could not be read.
+        is_known: whether it was in the index already.
+    """
+
+    path: Path
+    result: Examination | CurationError
+    is_known: bool
+
+
+class Examiner:
+    """Examines bags with one fitted curation; may be asked for the same bags again.
+
+    Attributes:
+        problem: why results could not be kept in the index; empty if they could.
+    """
+
+    def __init__(
+        self,
+        curation: Curation,
+        topic_map: TopicMap | None = None,
+        *,
+        jobs: int = 1,
+        backend: str = "loky",
+        fresh: bool = False,
+    ) -> None:
+        """Store how to work.
+
+        Args:
+            curation: fitted.
+            topic_map: how episodes are built; None: by the map in each bag.
+            jobs: workers; 1 works in this process, -1 takes all cores.
+            backend: one of BACKENDS, where there are several workers.
+            fresh: examine again what the index has; only once each.
+
+        Raises:
+            ConfigError: for a backend that does not exist, or is not installed.
+        """
+        check_workers(jobs, backend)
+        self._task = _Task(curation, topic_map, _key(curation, topic_map))
+        self._jobs = jobs
+        self._backend = backend
+        self._fresh = fresh
+        self._done: set[Path] = set()
+        self.problem = ""
+
+    def run(self, bags: Sequence[Path]) -> Iterator[Examined]:
+        """Examine bags, in their order; each result is kept as soon as it is there.
+
+        Memory does not grow with their number: workers are given a few batches ahead.
+
+        Raises:
+            CurationError: if a worker died; what was examined before is kept.
+        """
+        batches = [bags[k : k + _BATCH] for k in range(0, len(bags), _BATCH)]
+        # What this examiner has examined afresh is not examined afresh again.
+        jobs = ((b, self._fresh and not self._done.issuperset(b)) for b in batches)
+        for batch, stamps in self._spread(jobs):
+            self._keep(batch, stamps)
+            if self._fresh:
+                self._done.update(e.path for e in batch)
+            yield from batch
+
+    def _spread(
+        self, jobs: Iterable[tuple[Sequence[Path], bool]]
+    ) -> Iterator[tuple[list[Examined], dict[Path, str]]]:
+        try:
+            yield from spread(self._task, jobs, jobs=self._jobs, backend=self._backend)
+        except WorkerDiedError as err:
+            raise CurationError(
+                f"{err}: what was examined is kept, run the same command again to go on"
+            ) from err
+
+    def _keep(self, batch: Sequence[Examined], stamps: Mapping[Path, str]) -> None:
+        fresh = [e for e in batch if not e.is_known and isinstance(e.result, Examination)]
+        by_index: dict[Path, list[Examined]] = {}
+        for one in fresh:
+            by_index.setdefault(_home(one.path)[0], []).append(one)
+        for folder, found in by_index.items():
+            try:
+                self._task.index(folder).keep(self._task, found, stamps)
+            except CurationError as err:
+                self.problem = str(err)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What a worker does with a batch of bags; goes to it as a whole."""
+
+    curation: Curation
+    topic_map: TopicMap | None
+    key: str
+
+    def __call__(
+        self, bags: Sequence[Path], fresh: bool
+    ) -> tuple[list[Examined], dict[Path, str]]:
+        """Results in the order of the bags, and stamps of their files before they were read."""
+        stamps = {bag: _stamp(bag) for bag in bags}
+        known: dict[Path, Examination] = {}
+        if not fresh:
+            by_index: dict[Path, list[Path]] = {}
+            for bag in bags:
+                by_index.setdefault(_home(bag)[0], []).append(bag)
+            for folder, some in by_index.items():
+                with suppress(CurationError):  # no index, or one that is busy: work it out again
+                    known |= self.index(folder).look_up(self.key, some, stamps)
+        results = []
+        for bag in bags:
+            if bag in known:
+                results.append(Examined(bag, known[bag], is_known=True))
+                continue
+            try:
+                seen = self.curation.examine(read_episode(bag, self.topic_map))
+                results.append(Examined(bag, seen, is_known=False))
+            except CurationError as err:
+                results.append(Examined(bag, err, is_known=False))
+        return results, stamps
+
+    @staticmethod
+    def index(folder: Path) -> _Kept:
+        return _Kept(Index(folder, is_dataset=(folder / "episodes").is_dir()))
+
+
+class _Kept:
+    """The examinations in an index."""
+
+    def __init__(self, index: Index) -> None:
+        self._index = index
+
+    def look_up(
+        self, key: str, bags: Sequence[Path], stamps: Mapping[Path, str]
+    ) -> dict[Path, Examination]:
+        """What is known of bags that have not changed since."""
+        if not self._index.path.exists():
+            return {}
+        names = {_home(bag)[1]: bag for bag in bags}
+        marks = ",".join("?" * len(names))
+        with self._index.transaction() as db:
+            rows = db.execute(
+                "SELECT bag, stamp, result FROM examinations "
+                f"WHERE scoring_hash = ? AND bag IN ({marks})",
+                (key, *names),
+            ).fetchall()
+        found = {}
+        for name, stamp, text in rows:
+            bag = names[name]
+            if stamp and stamp == stamps[bag]:
+                with suppress(CurationError, ValueError):
+                    found[bag] = Examination.from_json(json.loads(text))
+        return found
+
+    def keep(self, task: _Task, found: Sequence[Examined], stamps: Mapping[Path, str]) -> None:
+        rows, scores = [], []
+        by = task.curation.scoring_hash
+        for one in found:
+            if not isinstance(one.result, Examination):
+                continue
+            seen = one.result
+            text = json.dumps(seen.to_json(), allow_nan=False)
+            rows.append((_home(one.path)[1], task.key, stamps[one.path], text))
+            scores += [
+                (seen.episode, scorer, by, value, seen.abstained.get(scorer))
+                for scorer, value in seen.scores.items()
+            ]
+        with self._index.transaction() as db:
+            db.executemany("INSERT OR REPLACE INTO examinations VALUES (?,?,?,?)", rows)
+            db.executemany("INSERT OR REPLACE INTO scores VALUES (?,?,?,?,?)", scores)
+
+
+def _key(curation: Curation, topic_map: TopicMap | None) -> str:
+    """Under which an examination is kept: another version of ours may see other things."""
+    by = "" if topic_map is None else f"+{topic_map.hash}"
+    return f"{__version__}+{curation.scoring_hash}{by}"
+
+
+def _home(bag: Path) -> tuple[Path, str]:
+    """Folder whose index has a bag (its dataset, or the folder around it), and its name there."""
+    folder = bag.resolve().parent
+    name = os.fsencode(bag.name).decode(errors="backslashreplace")  # SQLite takes UTF-8 alone
+    if folder.name == "episodes":
+        return folder.parent, f"episodes/{name}"
+    return folder, name
+
+
+def _stamp(bag: Path) -> str:
+    """Sizes and times of a bag's files; empty where they cannot be told."""
+    try:
+        if bag.is_dir():
+            with os.scandir(bag) as entries:
+                found = sorted((e.name, e.stat()) for e in entries if e.is_file())
+        else:
+            found = [(bag.name, bag.stat())]
+    except OSError:
+        return ""
+    return ";".join(f"{name}:{s.st_size}:{s.st_mtime_ns}" for name, s in found)
+
+
+class EpisodesOf:
+    """The readable episodes of bags, read again each time: for `Curation.fit_dataset`."""
+
+    def __init__(self, bags: Sequence[Path], topic_map: TopicMap | None) -> None:
+        """Name the bags."""
+        self._bags = bags
+        self._topic_map = topic_map
+
+    def __iter__(self) -> Iterator[Episode]:
+        seen = set()
+        for bag in self._bags:
+            try:
+                episode = read_episode(bag, self._topic_map)
+            except CurationError:  # reported when it is examined
+                continue
+            if episode.id not in seen:
+                seen.add(episode.id)
+                yield episode
+
+
+class Copies:
+    """Finds episodes with the content of another one, in the order in which they come."""
+
+    def __init__(self) -> None:
+        """Nothing has been seen yet."""
+        self._first: dict[bytes, tuple[str, str]] = {}
+
+    def note(self, seen: Examination) -> Examination:
+        """The examination, with a finding if an earlier one has the same content."""
+        if not seen.content or not seen.steps:
+            return seen
+        # Eight bytes: some ten thousand episodes are to fit into little memory.
+        key = bytes.fromhex(seen.content[:16])
+        original = self._first.get(key)
+        if original is not None:
+            return with_copy(seen, original)
+        if not untrustworthy(seen.findings):  # a bad copy does not make the good one a copy
+            self._first[key] = (seen.episode, seen.name)
+        return seen
+
+
+def with_copy(seen: Examination, original: tuple[str, str]) -> Examination:
+    """An examination with the finding that another episode (id, name) has the same content."""
+    # Its id alone: whether its name is known already depends on when one asks.
+    message = (
+        "the same episode is there more than once"
+        if original[0] == seen.episode
+        else f"same content as episode {original[0]}"
+    )
+    return replace(seen, findings=(*seen.findings, Finding("duplicate", message, seen.span)))
+
+
+def judge_bags(
+    examiner: Examiner,
+    curation: Curation,
+    bags: Sequence[Path],
+    *,
+    tie: TieKey | None = None,
+    progress: Callable[[Iterable[Examined]], Iterable[Examined]] = iter,
+) -> Iterator[tuple[Examined, Decision | None]]:
+    """Decide on bags, finally: a rule that looks at the dataset sees all of them first.
+
+    Args:
+        examiner: with that curation.
+        curation: fitted.
+        bags: in the order of their ids, so that of two copies the older one is the original.
+        tie: see `Rule.fit_dataset`.
+        progress: wraps the longest loop, for a bar.
+
+    Yields:
+        What was seen of each bag, and the decision; None where it could not be read.
+    """
+    ruling: Ruling | None = None
+    if curation.rule_looks_at_dataset:
+        scores: dict[str, float | None] = {}
+        copies = Copies()
+        for one in progress(examiner.run(bags)):
+            if isinstance(one.result, Examination):
+                seen = copies.note(one.result)
+                if curation.is_trusted(seen):
+                    scores[seen.episode] = seen.scores.get(curation.rule_scorer)
+        ruling = curation.ruling(scores, final=True, tie=tie)
+        results: Iterable[Examined] = examiner.run(bags)
+    else:
+        results = progress(examiner.run(bags))
+    copies = Copies()
+    for one in results:
+        if isinstance(one.result, Examination):
+            seen = copies.note(one.result)
+            yield replace(one, result=seen), curation.judge(seen, ruling)
+        else:
+            yield one, None

@@ -1,0 +1,244 @@
+"""Proof that labels are never an input: turn them all over in a copy, and score both.
+
+The dataset is copied twice, with its bags as links: once as it is, once with everything turned
+over that a person or a simulator has said about the episodes. Both copies are scored and decided
+from scratch. If a single bit differs, something reads labels.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from curation_ros.batch.examine import EpisodesOf, Examiner, judge_bags
+from curation_ros.configuration import read_reference
+from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.decision import CURATOR, Decision, Verdict
+from curation_ros.core.decision.examination import Examination
+from curation_ros.core.episode.topic_map import TopicMap
+from curation_ros.core.errors import CurationError
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.files import write_atomically
+
+#: Keys of truth.jsonl that say which episode it is, not how it went: start states order equal
+#: scores. All others are turned over, known or not.
+IDENTITY = ("episode", "name", "task", "start", "repetition", "expert_seed")
+_OPPOSITE = {"succeeded": "failed", "failed": "succeeded", "none": "early_release"}
+_OPPOSITE_VERDICT: dict[Verdict, Verdict] = {
+    "keep": "discard",
+    "salvage": "discard",
+    "review": "keep",
+    "discard": "keep",
+}
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What changed with the labels; both values as JSON text."""
+
+    episode: str
+    name: str
+    field: str
+    original: str
+    turned: str
+
+    def to_json(self) -> dict[str, str]:
+        """As printed by `curation self-check --json`."""
+        return dict(vars(self))
+
+
+@dataclass(frozen=True)
+class SelfCheck:
+    """Outcome of a self-check.
+
+    Attributes:
+        labels: values of truth.jsonl that were turned over, of dataset and reference.
+        overrides: decisions of people that were turned over, likewise.
+        episodes: that were scored and decided in both copies.
+        scores: numbers that were compared.
+        unreadable: bags that could be read in neither copy.
+        differences: what changed; empty where labels are not an input.
+    """
+
+    labels: int
+    overrides: int
+    episodes: int
+    scores: int
+    unreadable: int
+    differences: tuple[Difference, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """The last line of `curation self-check --json`."""
+        return {**vars(self), "differences": len(self.differences)}
+
+
+def self_check(
+    dataset: Dataset,
+    curation: Curation,
+    reference: Sequence[Path] = (),
+    topic_map: TopicMap | None = None,
+) -> SelfCheck:
+    """Score and decide with all labels as they are, and with all turned over.
+
+    Args:
+        dataset: nothing is written to it.
+        curation: configured; it is not changed.
+        reference: trusted demonstrations; the labels of those that are datasets are turned over,
+            too.
+        topic_map: how episodes are built; None: by the map in each bag.
+
+    Raises:
+        CurationError: if there is no label to turn over, or no episode that can be scored.
+    """
+    with tempfile.TemporaryDirectory(prefix="curation-self-check-") as folder:
+        home = Path(folder)
+        plain = _copies(dataset, reference, home / "as-is", turn=False)
+        other = _copies(dataset, reference, home / "turned", turn=True)
+        if not other.labels + other.overrides:
+            raise CurationError(
+                f"dataset {dataset.path}: nothing to turn over: no label in truth.jsonl and "
+                "no decision of a person, here or in the reference"
+            )
+        before, after = (_decide(c, copy.deepcopy(curation), topic_map) for c in (plain, other))
+    if not any(before.values()) and not any(after.values()):
+        raise CurationError(f"dataset {dataset.path}: no episode that can be scored")
+    differences = [
+        difference
+        for episode_id in sorted(before)
+        for difference in _compare(episode_id, before[episode_id], after[episode_id])
+    ]
+    compared = [i for i in before if before[i] is not None and after[i] is not None]
+    return SelfCheck(
+        labels=other.labels,
+        overrides=other.overrides,
+        episodes=len(compared),
+        scores=sum(v is not None for i in compared for v in (before[i] or {})["scores"].values()),
+        unreadable=sum(before[i] is None and after[i] is None for i in before),
+        differences=tuple(differences),
+    )
+
+
+@dataclass(frozen=True)
+class _Copies:
+    """Copies of a dataset and of its reference, and what is a label in them."""
+
+    dataset: Dataset
+    reference: list[Path]
+    labels: int
+    overrides: int
+
+
+def _copies(dataset: Dataset, reference: Sequence[Path], home: Path, *, turn: bool) -> _Copies:
+    target = Dataset(home / "dataset", create=True)
+    counts = [_copy(dataset, target, turn=turn)]
+    trusted = []
+    for k, path in enumerate(reference):
+        if not (path / "episodes").is_dir():
+            trusted.append(path)
+            continue
+        copied = Dataset(home / f"reference-{k}", create=True)
+        counts.append(_copy(Dataset(path), copied, turn=turn))
+        trusted.append(copied.path)
+    labels, overrides = (sum(found) for found in zip(*counts, strict=True))
+    return _Copies(target, trusted, labels, overrides)
+
+
+def _copy(source: Dataset, target: Dataset, *, turn: bool) -> tuple[int, int]:
+    """Copy bags as links, truth and decisions as they are or turned over; returns how many were.
+
+    What was made from labels or scores (index, selections, policies) stays behind.
+    """
+    for bag in source.bags():
+        shutil.copytree(bag, target.bag_path(bag.name), copy_function=_link)
+    truth = source.truth()
+    labels = sum(len(set(record) - set(IDENTITY)) for record in truth.values())
+    records = [turned(r) if turn else r for r in truth.values()]
+    if records:
+        text = "".join(json.dumps(r) + "\n" for r in records)
+        write_atomically(target.path / "truth.jsonl", text)
+    overrides = 0
+    for log in sorted((source.path / "decisions").glob("*.jsonl")):
+        decisions = source.decisions(log.stem)
+        overrides += sum(d.by != CURATOR for d in decisions)
+        lines = [(_turned_decision(d) if turn else d).to_line() + "\n" for d in decisions]
+        write_atomically(target.decision_log(log.stem), "".join(lines))
+    return labels, overrides
+
+
+def _link(source: str, target: str) -> None:
+    """A hard link, so that nothing leads back to the labels as they are; else a symbolic one."""
+    try:
+        os.link(source, target)
+    except OSError:  # another file system, or one without hard links
+        os.symlink(os.path.abspath(source), target)
+
+
+def turned(record: Mapping[str, Any]) -> dict[str, Any]:
+    """A line of truth.jsonl that says the contrary of everything but which episode it is."""
+    return {k: v if k in IDENTITY else _turned_value(k, v) for k, v in record.items()}
+
+
+def _turned_value(key: str, value: object) -> object:
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, (int, float)):
+        return -1 - value
+    if isinstance(value, str):
+        if key == "defect" and value != "none":
+            return "none"
+        return _OPPOSITE.get(value, f"not {value}")
+    return 0 if value is None else None
+
+
+def _turned_decision(decision: Decision) -> Decision:
+    if decision.by == CURATOR:
+        return decision
+    return replace(decision, verdict=_OPPOSITE_VERDICT[decision.verdict])
+
+
+def _decide(
+    copies: _Copies, curation: Curation, topic_map: TopicMap | None
+) -> dict[str, dict[str, Any] | None]:
+    """All that is said about each bag, as plain data; None where it cannot be read."""
+    bags = list(copies.dataset.bags())
+    trusted = copies.reference
+    curation.fit(read_reference(trusted, topic_map) if trusted else [])
+    if curation.needs_dataset:
+        curation.fit_dataset(EpisodesOf(bags, topic_map))
+    examiner = Examiner(curation, topic_map, fresh=True)
+    said: dict[str, dict[str, Any] | None] = {}
+    for one, decision in judge_bags(examiner, curation, bags, tie=copies.dataset.tie(0)):
+        said[one.path.name] = None
+        if decision is not None and isinstance(one.result, Examination):
+            said[one.path.name] = {**one.result.to_json(), **decision.to_json()}
+    return said
+
+
+def _compare(
+    episode_id: str, before: dict[str, Any] | None, after: dict[str, Any] | None
+) -> list[Difference]:
+    """What differs, by its field; numbers to the last bit, as `repr` shows them exactly."""
+    name = str((before or after or {}).get("name", ""))
+    if before is None or after is None:
+        if before is after:
+            return []
+        readable = [json.dumps(side is not None) for side in (before, after)]
+        return [Difference(episode_id, name, "readable", *readable)]
+    found = []
+    for key in sorted({*before, *after}):
+        pairs = {key: (before.get(key), after.get(key))}
+        if key == "scores":
+            scorers = sorted({*before[key], *after[key]})
+            pairs = {f"score/{s}": (before[key].get(s), after[key].get(s)) for s in scorers}
+        for field, pair in pairs.items():
+            original, other = (json.dumps(value, sort_keys=True) for value in pair)
+            if original != other:
+                found.append(Difference(episode_id, name, field, original, other))
+    return found

@@ -1,0 +1,1 @@
+"""From evidence to a decision: rules, verdicts, spans and selections."""

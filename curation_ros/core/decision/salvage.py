@@ -1,0 +1,72 @@
+"""What can be saved of an episode: of a recording that is bad at an end, of a task that failed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from curation_ros.core.episode.findings import Finding
+from curation_ros.core.types import NS_PER_S
+
+if TYPE_CHECKING:
+    from curation_ros.core.episode.episode import Episode
+
+#: Faults that say exactly which steps they spoil: the rest is as good as if they were not there.
+#: Of all others (a hole, lost messages) only a person can say what they have cost.
+CONFINED = ("padded-tail", "not-finite")
+#: A part shorter than this share of the episode is no demonstration any more.
+_LEAST_SHARE = 0.5
+#: What a good beginning keeps away from the break, unless something else is asked for.
+DEFAULT_MARGIN_S = 0.75
+#: A beginning shorter than this shows nothing of a task.
+LEAST_PREFIX_S = 1.0
+
+
+def sound_part(episode: Episode, faults: Iterable[Finding]) -> tuple[int, int] | None:
+    """First and last step of what is left when spoilt ends are cut off.
+
+    Args:
+        episode: the episode, whole.
+        faults: its findings that need a person.
+
+    Returns:
+        None where nothing is spoilt, a fault spoils more than an end, or too little is left.
+    """
+    found = list(faults)
+    if not found or any(f.id not in CONFINED for f in found):
+        return None
+    good = np.ones(len(episode), dtype=bool)
+    offsets = episode.stamps_ns - episode.start_ns
+    for fault in found:
+        if fault.id == "padded-tail":
+            good &= ~((offsets >= fault.span[0]) & (offsets <= fault.span[1]))
+    for values in episode.fields.values():
+        good &= np.isfinite(values).all(axis=1)
+    steps = np.flatnonzero(good)
+    if len(steps) in (0, len(episode)):
+        return None
+    first, last = int(steps[0]), int(steps[-1])
+    whole = last - first + 1 == len(steps)  # a spoilt step inside is no spoilt end
+    if not whole or len(steps) < max(2.0, _LEAST_SHARE * len(episode)):
+        return None
+    return first, last
+
+
+def good_prefix(episode: Episode, broke_at: int, margin_s: float) -> tuple[int, int] | None:
+    """First and last step of the beginning of an episode, up to a margin before it broke.
+
+    Args:
+        episode: the episode, whole.
+        broke_at: step at which something went wrong.
+        margin_s: at least so long before that step the beginning ends, in seconds of its stamps.
+
+    Returns:
+        None where less than LEAST_PREFIX_S is left.
+    """
+    until_ns = int(episode.stamps_ns[broke_at]) - max(1, round(margin_s * NS_PER_S))
+    last = int(np.searchsorted(episode.stamps_ns, until_ns, side="right")) - 1
+    if last < 1 or episode.stamps_ns[last] - episode.stamps_ns[0] < LEAST_PREFIX_S * NS_PER_S:
+        return None
+    return 0, last

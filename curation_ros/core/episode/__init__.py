@@ -1,0 +1,1 @@
+"""Samples become an episode: the stream, the topic map, the gate and the builder."""

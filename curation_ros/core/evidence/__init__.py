@@ -1,0 +1,1 @@
+"""What can be seen in an episode: fingers, carries, alerts, checks, length."""

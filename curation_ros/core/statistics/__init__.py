@@ -1,0 +1,1 @@
+"""Statistics of scores and of policies: detection, intervals, contrasts."""

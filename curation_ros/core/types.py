@@ -1,0 +1,13 @@
+"""Types and units that every package shares."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+#: First and last nanosecond, inclusive; of an episode, counted from its start stamp.
+Span = tuple[int, int]
+
+NS_PER_S = 1_000_000_000

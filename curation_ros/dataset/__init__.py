@@ -1,0 +1,1 @@
+"""A dataset on disk: its bags, logs, index, selections and exports."""

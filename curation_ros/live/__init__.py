@@ -1,0 +1,1 @@
+"""Recorder and curator while the robot moves, without ROS."""

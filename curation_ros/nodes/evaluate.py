@@ -1,0 +1,149 @@
+"""Evaluation of policies on the graph: sim_node and policy_node in lockstep, outcomes counted."""
+
+from __future__ import annotations
+
+import json
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from curation_ros.core.errors import CurationError
+from curation_ros.core.statistics.intervals import wilson
+from curation_ros.nodes.processes import Domain, Nodes
+
+# A step takes milliseconds; with this much silence something hangs.
+_SILENCE_S = 120.0
+# What the transport has lost comes again after 3 s, on a busy machine a second time. A node that
+# has ended is noticed at once.
+_ANSWER_S = 15.0
+
+
+def evaluate_on_graph(
+    policy: Path,
+    policy_id: str,
+    starts: str,
+    *,
+    max_steps: int = 500,
+    log_folder: Path,
+    stop: threading.Event | None = None,
+) -> Iterator[dict[str, Any]]:
+    """Drive a policy over DDS from each start; the graph runs on a domain of its own.
+
+    Args:
+        policy: folder of the policy.
+        policy_id: for the rows.
+        starts: as sim_node's parameter `starts`, such as official:0:10.
+        max_steps: after which a rollout has failed.
+        log_folder: for the nodes' logs.
+        stop: set by another thread, ends the evaluation early.
+
+    Yields:
+        A row a rollout as it ends: policy, start, success, steps, stage.
+
+    Raises:
+        CurationError: if a node ends or falls silent, or a rollout was not driven to its end: that
+            is no failure of the policy.
+    """
+    n = count_starts(starts)
+    domain = Domain()
+    with (
+        tempfile.TemporaryDirectory(prefix="curation_ros-evaluate-") as folder,
+        Nodes(domain, log_folder) as nodes,
+    ):
+        try:
+            nodes.start("policy_node", {"policy": policy})
+            nodes.start(
+                "sim_node",
+                {
+                    "mode": "command",
+                    "episodes": n,
+                    "starts": starts,
+                    "task": "rollout",
+                    "max_steps": max_steps,
+                    "steps_after_success": 0,
+                    "command_timeout_s": _ANSWER_S,
+                    "dataset": folder,
+                    "wait_for": ["policy_node"],
+                },
+            )
+            seen, heard_s = 0, time.monotonic()
+            while seen < n and not (stop is not None and stop.is_set()):
+                ended = nodes.ended("sim_node") is not None
+                _check_nodes(nodes, log_folder)
+                lines = _whole_lines(Path(folder) / "truth.jsonl")
+                for line in lines[seen:]:
+                    yield _row(policy_id, json.loads(line))
+                if len(lines) > seen:
+                    seen, heard_s = len(lines), time.monotonic()
+                elif ended:
+                    raise CurationError(f"sim_node ended after {seen} of {n} rollouts")
+                elif time.monotonic() - heard_s > _SILENCE_S:
+                    raise CurationError(
+                        f"no rollout has ended for {_SILENCE_S:g} s: see {log_folder}/sim_node.log"
+                    )
+                else:
+                    time.sleep(0.1)
+        finally:
+            domain.close()
+
+
+def _check_nodes(nodes: Nodes, log_folder: Path) -> None:
+    """Complain of a node that has ended too early; of one that refused to run, with its words."""
+    for node in ("policy_node", "sim_node"):
+        code = nodes.ended(node)
+        log = log_folder / f"{node}.log"
+        if code is not None and code < 0:
+            name = signal.Signals(-code).name
+            raise CurationError(f"{node} was ended by signal {name}: its log is {log}")
+        if code == 0 and node == "policy_node":
+            raise CurationError(f"{node} was stopped by somebody else: its log is {log}")
+    nodes.check()
+
+
+def count_starts(spec: str) -> int:
+    """Number of starts that a specification names, without building them.
+
+    Raises:
+        CurationError: if it is none.
+    """
+    from sim_node.starts import start_names
+
+    return len(start_names(spec))
+
+
+def summary(policy_id: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The last row of an evaluation: successes with Wilson's 95 % interval."""
+    successes = sum(bool(row["success"]) for row in rows)
+    low, high = wilson(successes, len(rows))
+    return {
+        "policy": policy_id,
+        "successes": successes,
+        "rollouts": len(rows),
+        "rate": successes / len(rows),
+        "ci95": [low, high],
+        "interval": "wilson",
+    }
+
+
+def _whole_lines(path: Path) -> list[str]:
+    try:
+        text = path.read_text()
+    except FileNotFoundError:
+        return []
+    return text[: text.rfind("\n") + 1].splitlines()
+
+
+def _row(policy_id: str, truth: dict[str, Any]) -> dict[str, Any]:
+    if truth["aborted"]:
+        raise CurationError(f"rollout from {truth['start']} was aborted: {truth['aborted']}")
+    return {
+        "policy": policy_id,
+        "start": truth["start"],
+        "success": truth["outcome"] == "succeeded",
+        "steps": truth["steps"],
+        "stage": truth["stage"],
+    }

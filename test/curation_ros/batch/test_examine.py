@@ -1,0 +1,272 @@
+"""Many bags: the same results however the work is spread, kept, interrupted or taken up again."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from episodes import make_episode, make_reference
+from streams import record
+
+from curation_ros.batch.examine import Copies, EpisodesOf, Examined, Examiner, judge_bags
+from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.examination import Examination
+from curation_ros.core.episode.identity import new_episode_id
+from curation_ros.core.errors import BagError, ConfigError, CurationError
+from curation_ros.dataset.dataset import Dataset
+
+SCORERS = ("gripper_timing", "knn", "length")
+N_BAGS = 40
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Curation:
+    return Curation(scorers=SCORERS).fit(make_reference(np.random.default_rng(7)))
+
+
+@pytest.fixture(scope="module")
+def _recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("many")
+    dataset = Dataset(folder / "data", create=True)
+    rng = np.random.default_rng(11)
+    for k in range(N_BAGS):
+        record(dataset, make_episode(rng, open_at=140 if k % 4 == 3 else -1, name=f"pick-{k}"))
+    return folder / "data"
+
+
+@pytest.fixture
+def data(_recorded: Path, tmp_path: Path) -> Path:
+    shutil.copytree(_recorded, tmp_path / "data")
+    return tmp_path / "data"
+
+
+def bags_of(data: Path) -> list[Path]:
+    return list(Dataset(data).bags())
+
+
+def texts(results: Iterator[Examined]) -> list[tuple[str, object]]:
+    return [
+        (e.path.name, e.result.to_json() if isinstance(e.result, Examination) else str(e.result))
+        for e in results
+    ]
+
+
+# --- kept ---------------------------------------------------------------------------------------
+
+
+def test_second_run_reads_nothing_and_says_the_same(data: Path, fitted: Curation) -> None:
+    first = list(Examiner(fitted).run(bags_of(data)))
+    second = list(Examiner(fitted).run(bags_of(data)))
+    assert [e.is_known for e in first] == [False] * N_BAGS
+    assert [e.is_known for e in second] == [True] * N_BAGS
+    assert [e.result for e in first] == [e.result for e in second]
+
+
+def test_only_what_is_new_or_has_changed_is_scored(data: Path, fitted: Curation) -> None:
+    list(Examiner(fitted).run(bags_of(data)))
+    changed, *_ = bags_of(data)
+    os.utime(next(changed.glob("*.mcap")), ns=(1, 1))
+    added = record(Dataset(data), make_episode(np.random.default_rng(99), name="new"))
+    fresh = [e.path for e in Examiner(fitted).run(bags_of(data)) if not e.is_known]
+    assert sorted(fresh) == sorted([changed, added])
+
+
+def test_other_scorers_are_other_results(data: Path, fitted: Curation) -> None:
+    list(Examiner(fitted).run(bags_of(data)))
+    other = Curation(scorers=SCORERS).fit(make_reference(np.random.default_rng(8)))
+    assert not any(e.is_known for e in Examiner(other).run(bags_of(data)))
+    again = Curation(scorers=SCORERS, rule="none").fit(make_reference(np.random.default_rng(7)))
+    assert all(e.is_known for e in Examiner(again).run(bags_of(data)))  # a rule needs no reading
+
+
+def test_fresh_examines_again_but_each_bag_once(data: Path, fitted: Curation) -> None:
+    list(Examiner(fitted).run(bags_of(data)))
+    examiner = Examiner(fitted, fresh=True)
+    assert not any(e.is_known for e in examiner.run(bags_of(data)))
+    assert all(e.is_known for e in examiner.run(bags_of(data)))
+
+
+def test_interrupted_run_goes_on_where_it_stopped(data: Path, fitted: Curation) -> None:
+    running = Examiner(fitted).run(bags_of(data))
+    seen = [next(running).path for _ in range(20)]
+    running.close()
+    again = list(Examiner(fitted).run(bags_of(data)))
+    known = [e.path for e in again if e.is_known]
+    assert set(seen) <= set(known)
+    assert len(known) < N_BAGS
+
+
+def test_killed_run_goes_on_where_it_stopped(data: Path, fitted: Curation, tmp_path: Path) -> None:
+    for bag in bags_of(data) * 3:  # so many lines do not fit into the pipe
+        shutil.copytree(bag, data / "episodes" / new_episode_id())
+    config = tmp_path / "curation.yaml"
+    config.write_text(f"scorers: [{', '.join(SCORERS)}]\nrule: none\nrule_scorer: length\n")
+    command = [sys.executable, "-m", "curation_ros.cli.main", "score", str(data), "--json"]
+    command += ["--config", str(config)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()  # the first batch is kept; nobody reads on
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    [kept] = Dataset(data).rows("SELECT count(*) AS n FROM examinations")
+    assert 0 < kept["n"] < 4 * N_BAGS
+    done = subprocess.run(command[:-3] + command[-2:], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert f"scored {4 * N_BAGS}, of which {kept['n']} were known" in done.stderr
+
+
+def test_rebuilding_the_index_forgets_what_was_examined(data: Path, fitted: Curation) -> None:
+    list(Examiner(fitted).run(bags_of(data)))
+    assert Dataset(data).rebuild() == []
+    assert not any(e.is_known for e in Examiner(fitted).run(bags_of(data)))
+
+
+def test_unreadable_bag_is_an_error_each_time_and_the_rest_is_scored(
+    data: Path, fitted: Curation
+) -> None:
+    bad = bags_of(data)[5]
+    next(bad.glob("*.mcap")).write_bytes(b"")
+    for _ in range(2):
+        results = list(Examiner(fitted).run(bags_of(data)))
+        wrong = [e for e in results if isinstance(e.result, CurationError)]
+        assert [e.path for e in wrong] == [bad]
+        assert isinstance(wrong[0].result, BagError)
+        assert len(results) == N_BAGS
+
+
+def test_folder_that_is_no_dataset_stays_as_it_is(
+    data: Path, fitted: Curation, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = tmp_path / "bags"
+    shutil.move(data / "episodes", folder)
+    bags = sorted(p for p in folder.iterdir() if p.name[0] != ".")
+    before = sorted(folder.rglob("*"))
+    assert not any(e.is_known for e in Examiner(fitted).run(bags))
+    assert all(e.is_known for e in Examiner(fitted).run(bags))
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_index_that_cannot_be_written_costs_no_result(
+    data: Path, fitted: Curation, tmp_path: Path
+) -> None:
+    good = texts(Examiner(fitted).run(bags_of(data)))
+    Dataset(data).index.path.unlink()
+    Dataset(data).index.path.mkdir()  # even root cannot open that as a database
+    examiner = Examiner(fitted)
+    assert texts(examiner.run(bags_of(data))) == good
+    assert "index" in examiner.problem
+
+
+# --- spread -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("backend", ["loky", "ray", "dask"])
+def test_workers_give_the_same_results_in_the_same_order(
+    data: Path, fitted: Curation, backend: str
+) -> None:
+    if backend == "ray":
+        pytest.importorskip("ray", reason="the extra 'ray' is not installed")
+    if backend == "dask":
+        pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
+    alone = texts(Examiner(fitted).run(bags_of(data)))
+    Dataset(data).index.path.unlink()
+    spread = Examiner(fitted, jobs=2, backend=backend)
+    assert texts(spread.run(bags_of(data))) == alone
+    assert all(e.is_known for e in Examiner(fitted).run(bags_of(data)))
+
+
+def test_worker_that_dies_is_told_in_one_line(data: Path, fitted: Curation) -> None:
+    class Deadly(Curation):
+        def examine(self, episode: object) -> Examination:
+            os.kill(os.getpid(), signal.SIGKILL)
+            raise AssertionError
+
+    deadly = Deadly(scorers=SCORERS).fit(make_reference(np.random.default_rng(7)))
+    with pytest.raises(CurationError, match="a worker died"):
+        list(Examiner(deadly, jobs=2).run(bags_of(data)))
+
+
+@pytest.mark.parametrize("options", [{"backend": "slurm"}, {"jobs": 0}, {"jobs": -2}])
+def test_bad_options_are_refused(fitted: Curation, options: dict[str, object]) -> None:
+    with pytest.raises(ConfigError):
+        Examiner(fitted, **options)  # type: ignore[arg-type]
+
+
+# --- copies and rules over the dataset ----------------------------------------------------------
+
+
+def test_copy_of_an_episode_is_found_whatever_it_is_called(data: Path, fitted: Curation) -> None:
+    original = make_episode(np.random.default_rng(5), episode_id=new_episode_id(), name="first")
+    record(Dataset(data), original)
+    record(Dataset(data), replace(original, id=new_episode_id(), name="again"))
+    judged = list(judge_bags(Examiner(fitted), fitted, bags_of(data)))
+    copies = [d for _, d in judged if d and any(f.id == "duplicate" for f in d.findings)]
+    assert [(d.name, d.verdict) for d in copies] == [("again", "review")]
+    assert copies[0].reason == f"duplicate: same content as episode {original.id}"
+
+
+def test_copies_are_told_by_content_alone() -> None:
+    seen = Examination("a", "pick-1", 5, (0, 9), {}, content="ab" * 32)
+    copies = Copies()
+    assert copies.note(seen) == seen
+    assert copies.note(replace(seen, episode="b", content="cd" * 32)).findings == ()
+    assert [f.id for f in copies.note(replace(seen, episode="c")).findings] == ["duplicate"]
+    empty = replace(seen, episode="d", steps=0)
+    assert copies.note(empty) == empty
+
+
+def test_share_is_of_the_trusted_episodes_and_final(data: Path) -> None:
+    broken = make_episode(np.random.default_rng(5), name="broken")
+    shutil.copytree(record(Dataset(data), broken), data / "episodes" / new_episode_id())
+    rule = {"rule": "top-fraction", "rule_scorer": "length", "rule_params": {"value": 0.5}}
+    curation = Curation(scorers=SCORERS, **rule).fit([])  # type: ignore[arg-type]
+    judged = [d for _, d in judge_bags(Examiner(curation), curation, bags_of(data)) if d]
+    assert {d.evidence["basis"] for d in judged} == {"final"}
+    assert {d.evidence["fitted_on"]["episodes"] for d in judged} == {N_BAGS + 1}
+    assert len({d.evidence["fitted_on"]["hash"] for d in judged}) == 1
+    left_out = [d for d in judged if d.verdict == "discard"]
+    assert len(left_out) == 20  # of 41, half are kept, rounded as a person does
+    for decision in judged:
+        reasons = {"wrong-id", "opened-early"} & {f.id for f in decision.findings}
+        assert (decision.verdict == "review") <= bool(reasons), decision
+
+
+def test_twins_are_fitted_on_the_dataset_itself(data: Path) -> None:
+    curation = Curation(
+        scorers=("knn_label_free", "length"), rule="gap", rule_scorer="knn_label_free"
+    ).fit([])
+    assert curation.needs_dataset
+    seen = [e.result for e in Examiner(curation).run(bags_of(data))]
+    assert all(isinstance(e, Examination) and e.scores["knn_label_free"] is None for e in seen)
+    before = curation.scoring_hash
+    curation.fit_dataset(EpisodesOf(bags_of(data), None))
+    assert curation.scoring_hash != before
+    again = [e.result for e in Examiner(curation).run(bags_of(data))]
+    assert all(isinstance(e, Examination) and e.scores["knn_label_free"] for e in again)
+
+
+def test_processes_that_score_at_once_agree(data: Path, tmp_path: Path) -> None:
+    config = tmp_path / "curation.yaml"
+    config.write_text(f"scorers: [{', '.join(SCORERS)}]\nrule: none\nrule_scorer: length\n")
+    command = [sys.executable, "-m", "curation_ros.cli.main", "score", str(data), "--json"]
+    command += ["--config", str(config)]
+    rebuild = [sys.executable, "-m", "curation_ros.cli.main", "index", str(data), "--rebuild"]
+    running = [
+        subprocess.Popen(c, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for c in (command, command, rebuild, command)
+    ]
+    outputs = [process.communicate() for process in running]
+    assert [process.returncode for process in running] == [0] * 4, outputs
+    assert [err for _, err in outputs] == [""] * 4
+    scored = {outputs[k][0] for k in (0, 1, 3)}
+    assert len(scored) == 1
+    assert scored.pop().count("\n") == N_BAGS

@@ -1,0 +1,218 @@
+"""Rows of a study that are what the curator decides: whole, salvaged, cut at random."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import LIFT_AT, N_STEPS, RATE_HZ, RELEASE_AT, scene, without
+
+from curation_ros.core.decision.salvage import DEFAULT_MARGIN_S
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.errors import EpisodeError
+from curation_ros.dataset.dataset import Dataset
+from curation_ros.files import append_line
+from curation_ros.study.curated import curate, facts_of, phases_alone
+from curation_ros.study.pools import Pool, TrainingSet, training_set
+
+DROPS = (LIFT_AT + 20, LIFT_AT + 40, LIFT_AT + 60)
+MARGIN = round(DEFAULT_MARGIN_S * RATE_HZ)
+MARGINS = (0, 5, MARGIN)
+
+
+def named(episode: Episode, k: int) -> Episode:
+    """With a name, and the noise without which a recording counts as frozen."""
+    rng = np.random.default_rng(k)
+    fields = dict(episode.fields)
+    for field in ("eef_position", "bowl_position", "plate_position", "joint_position"):
+        fields[field] = fields[field] + 1e-5 * rng.standard_normal(fields[field].shape)
+    return replace(episode, id=f"a-{k}", name=f"bowl-{k:04}", fields=fields)
+
+
+def scenes_of() -> list[Episode]:
+    """Two that succeed, and one for each of DROPS."""
+    broken = [scene(dropped_at=at, opened_at=at) for at in DROPS]
+    return [named(episode, k) for k, episode in enumerate([scene(), scene(), *broken])]
+
+
+def pool_of(folder: Path, episodes: Sequence[Episode], margins: Sequence[int] = MARGINS) -> Pool:
+    return Pool(
+        name="made",
+        dataset=Dataset(folder / "pool", create=True),
+        episodes=tuple(e.id for e in episodes),
+        names={e.id: e.name for e in episodes},
+        good={e.id: k < 2 for k, e in enumerate(episodes)},
+        scores={},
+        needs={},
+        timelines={e.id: phases_alone(e) for e in episodes},
+        curated=curate(episodes, margins),
+    )
+
+
+@pytest.fixture
+def pool(tmp_path: Path) -> Pool:
+    return pool_of(tmp_path, scenes_of())
+
+
+@pytest.fixture
+def reference(tmp_path: Path) -> Dataset:
+    return Dataset(tmp_path / "reference", create=True)
+
+
+@pytest.fixture
+def more(tmp_path: Path) -> Dataset:
+    """Four further demonstrations; the second by name has failed."""
+    made = Dataset(tmp_path / "more", create=True)
+    for k, outcome in enumerate(("succeeded", "failed", "succeeded", "succeeded")):
+        line = {"episode": f"z-{9 - k}", "name": f"bowl-{k:04}", "outcome": outcome}
+        append_line(made.path / "truth.jsonl", line)
+    return made
+
+
+def spans(made: TrainingSet) -> dict[str, tuple[int, int] | None]:
+    return {bag.name: span for bag, span in made.bags}
+
+
+def last_steps(pool: Pool, made: TrainingSet) -> dict[str, int]:
+    """Id of each demonstration that is there in part -> its last step."""
+    return {
+        i: len(pool.timelines[i].within(span)) - 1
+        for i, span in spans(made).items()
+        if span is not None
+    }
+
+
+def test_what_is_decided_is_whole_and_what_broke_is_salvaged(
+    pool: Pool, reference: Dataset
+) -> None:
+    whole = training_set(pool, "decided", reference, 0)
+    assert spans(whole) == {"a-0": None, "a-1": None}
+    assert (whole.n_pool, whole.n_good, whole.n_salvaged) == (2, 2, 0)
+    both = training_set(pool, "decided+salvaged", reference, 0)
+    assert (both.n_pool, both.n_good, both.n_salvaged) == (5, 2, 3)
+    assert both.needs == whole.needs == ("object pose",)
+    assert last_steps(pool, both) == {f"a-{k}": at - MARGIN for k, at in enumerate(DROPS, start=2)}
+    assert both.to_json(pool.timelines)["contamination"] == 0
+
+
+@pytest.mark.parametrize("margin", MARGINS)
+def test_a_margin_is_so_many_control_steps(pool: Pool, reference: Dataset, margin: int) -> None:
+    made = training_set(pool, f"salvaged-{margin}", reference, 0)
+    # Something is kept away from the break even without a margin: the step of the break itself.
+    ends = [at - max(1, margin) for at in DROPS]
+    assert list(last_steps(pool, made).values()) == ends
+
+
+def test_sets_that_hold_the_same_have_one_id(pool: Pool, reference: Dataset) -> None:
+    def id_of(row: str) -> str:
+        return training_set(pool, row, reference, 0).id
+
+    assert id_of("decided+salvaged") == id_of(f"salvaged-{MARGIN}+decided")
+    assert id_of("decided") == id_of("oracle")
+    ids = {id_of(row) for row in ("decided", "salvaged", "salvaged-0", "decided+salvaged")}
+    assert len(ids) == 4
+
+
+def test_a_demonstration_that_two_terms_show_is_there_once_and_longer(
+    pool: Pool, reference: Dataset
+) -> None:
+    for row in ("salvaged-15+salvaged-0", "salvaged-0+salvaged-15"):
+        made = training_set(pool, row, reference, 0)
+        assert spans(made) == spans(training_set(pool, "salvaged-0", reference, 0))
+    for row in ("everything+salvaged", "salvaged+everything"):
+        made = training_set(pool, row, reference, 0)
+        assert made.id == training_set(pool, "everything", reference, 0).id
+
+
+def test_random_cuts_are_those_of_the_seed_and_of_the_names(
+    pool: Pool, reference: Dataset, tmp_path: Path
+) -> None:
+    def cuts(pool: Pool, draw: int) -> list[int]:
+        return list(
+            last_steps(pool, training_set(pool, "random_cut", reference, 0, draw)).values()
+        )
+
+    drawn = [tuple(cuts(pool, k)) for k in range(40)]
+    assert len(set(drawn)) > 30
+    assert drawn[3] == tuple(cuts(pool, 3))
+    named_draw = training_set(pool, "random_cut#3", reference, 0, 7)
+    assert tuple(last_steps(pool, named_draw).values()) == drawn[3]
+    ends = [end for some in drawn for end in some]
+    assert min(ends) >= 1
+    assert min(ends) < N_STEPS / 8
+    assert N_STEPS * 7 / 8 < max(ends) < N_STEPS
+    # Other ids, same names: a dataset that was collected again.
+    again = [replace(e, id=f"b{9 - k}") for k, e in enumerate(scenes_of())]
+    other = pool_of(tmp_path / "again", again)
+    by_name = [
+        last_steps(other, training_set(other, "random_cut", reference, 0, 3))[f"b{9 - k}"]
+        for k in (2, 3, 4)
+    ]
+    assert by_name == list(drawn[3])
+
+
+def test_more_are_the_first_that_succeeded(pool: Pool, reference: Dataset, more: Dataset) -> None:
+    made = training_set(pool, "oracle+more@2", reference, 0, more=more)
+    assert set(spans(made)) == {"a-0", "a-1", "z-9", "z-7"}
+    assert (made.n_pool, made.n_good, made.n_more) == (2, 2, 2)
+    assert made.needs == ("labels", "more clean demonstrations")
+    assert made.to_json(pool.timelines)["n"] == 4
+    with pytest.raises(EpisodeError, match="3 succeeded, cannot keep 4"):
+        training_set(pool, "more@4", reference, 0, more=more)
+
+
+def test_phases_of_a_set_are_counted_within_the_spans(pool: Pool, reference: Dataset) -> None:
+    row = training_set(pool, "decided+salvaged", reference, 0).to_json(pool.timelines)
+    assert set(row["spans"]) == {"a-2", "a-3", "a-4"}
+    assert row["phases"]["LIFT"]["demonstrations"] == 5
+    assert row["phases"]["TRANSPORT"]["demonstrations"] == 2
+    assert row["phases"]["RELEASE"] == {"demonstrations": 2, "steps": 2 * (N_STEPS - RELEASE_AT)}
+    kept = [at - MARGIN + 1 for at in DROPS]
+    steps = sum(counts["steps"] for counts in row["phases"].values())
+    assert steps == 2 * N_STEPS + sum(kept)
+    assert "spans" not in training_set(pool, "decided", reference, 0).to_json(pool.timelines)
+
+
+def test_facts_are_decisions_against_the_truth(pool: Pool) -> None:
+    assert pool.curated is not None
+    released = {f"a-{k}": at for k, at in enumerate(DROPS, start=2)}
+    facts = facts_of(pool.curated, pool.good, released, pool.timelines)
+    assert facts["verdicts"]["keep"] == {"good": 2, "defective": 0}
+    assert facts["verdicts"]["salvage"] == {"good": 0, "defective": 3}
+    assert facts["verdicts"]["review"] == {"good": 0, "defective": 0}
+    assert facts["decided_by"] == {"object_coupling": 5}
+    late = {"n": 3, "min": -MARGIN, "median": -MARGIN, "max": -MARGIN}
+    assert facts["cut_minus_release"] == late
+    assert facts_of(pool.curated, pool.good, {}, pool.timelines)["cut_minus_release"] is None
+
+
+def test_without_poses_gripper_and_phase_decide_and_nothing_is_needed(
+    tmp_path: Path, reference: Dataset
+) -> None:
+    pool = pool_of(tmp_path, [without(e, "object") for e in scenes_of()])
+    made = training_set(pool, "decided+salvaged", reference, 0)
+    assert made.needs == ("nothing",)
+    assert (made.n_pool, made.n_salvaged) == (5, 3)
+
+
+def test_a_beginning_that_is_too_short_with_a_margin_is_there_with_a_smaller_one(
+    tmp_path: Path, reference: Dataset
+) -> None:
+    pool = pool_of(tmp_path, scenes_of(), (0, 80))
+    assert training_set(pool, "salvaged-0", reference, 0).n_salvaged == 3
+    assert training_set(pool, "salvaged-80", reference, 0).n_salvaged < 3
+
+
+def test_an_example_is_the_first_by_name_of_those_that_broke(pool: Pool) -> None:
+    assert pool.curated is not None
+    assert pool.curated.example is not None
+    assert pool.curated.example.id == "a-2"
+    assert curate([scene()]).example is None
+
+
+def test_a_pool_that_the_curator_has_not_seen_is_named(pool: Pool, reference: Dataset) -> None:
+    with pytest.raises(EpisodeError, match="pool 'made': the curator has not decided"):
+        training_set(replace(pool, curated=None), "decided", reference, 0)

@@ -1,0 +1,195 @@
+"""Plans of studies: what they may say, and what is refused before an hour of work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from curation_ros.core.errors import ConfigError
+from curation_ros.core.scorers import SCORERS
+from curation_ros.study.plan import Term, parse_row, plan_from, read_plan
+
+CONFIG = Path(__file__).parents[3] / "config"
+
+RAW: dict[str, Any] = {
+    "name": "small",
+    "question": "which?",
+    "reference": {"episodes": 2},
+    "pools": {"paired": {"episodes": 4}},
+    "scorers": ["knn", "length"],
+    "stages": [
+        {
+            "name": "look",
+            "kind": "screen",
+            "pools": ["paired"],
+            "variants": ["relative"],
+            "seeds": [1, 2, 3],
+            "starts": "generated:1:2",
+            "rows": ["everything", "knn@{2,3}", "random@2#{0..3}"],
+        }
+    ],
+}
+
+
+def changed(change: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    raw = deepcopy(RAW)
+    change(raw)
+    return raw
+
+
+@pytest.mark.parametrize("name", ["paper", "question", "salvage"])
+def test_the_plans_of_the_repository_are_whole(name: str) -> None:
+    plan = read_plan(CONFIG / f"{name}.yaml")
+    assert plan.name == name
+    assert all(stage.cells() for stage in plan.stages)
+
+
+def test_the_paper_protocol_is_that_of_the_paper() -> None:
+    [stage] = read_plan(CONFIG / "paper.yaml").stages
+    assert stage.seeds == (42, 0, 7)
+    assert {t.keep for r in stage.rows for t in parse_row(r)} == {None, 60}
+    # Two pools, two variants, and ten conditions: seven metrics, length, everything, oracle.
+    assert len(stage.cells()) == 2 * 2 * 10
+
+
+def test_rows_are_read_term_by_term() -> None:
+    assert parse_row("reference + knn@16") == (Term("reference"), Term("knn", 16))
+    assert parse_row("random@16#3") == (Term("random", 16, 3),)
+    assert parse_row("button%10") == (Term("button", wrong=10),)
+    assert parse_row("oracle") == (Term("oracle"),)
+    assert parse_row("random@16")[0].is_drawn
+    assert not parse_row("random@16#0")[0].is_drawn
+    assert parse_row("decided+salvaged-15") == (Term("decided"), Term("salvaged", margin=15))
+    assert parse_row("salvaged-0")[0].margin == 0
+    assert parse_row("salvaged")[0].margin is None
+    assert parse_row("random_cut")[0].is_drawn
+    assert parse_row("oracle+more@16") == (Term("oracle"), Term("more", 16))
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("knn", "knn needs a number to keep"),
+        ("knn@0", "knn needs a number to keep"),
+        ("everything@3", "everything takes no @K"),
+        ("nobody@3", "'nobody@3' is none; known are everything"),
+        ("knn@3#1", "knn has no draws"),
+        ("button", "%P is for button"),
+        ("knn@3%10", "%P is for button"),
+        ("decided-15", "-M is for salvaged"),
+        ("decided@3", "decided takes no @K"),
+        ("salvaged#2", "salvaged has no draws"),
+        ("more", "more needs a number to keep"),
+        ("", "is none"),
+        ("knn@16+", "is none"),
+    ],
+)
+def test_rows_that_make_no_sense_are_named(row: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        parse_row(row)
+
+
+def test_rows_in_braces_are_several() -> None:
+    [stage] = plan_from(RAW).stages
+    assert stage.rows[:3] == ("everything", "knn@2", "knn@3")
+    assert stage.rows[3:] == tuple(f"random@2#{k}" for k in range(4))
+    # A draw has one of the seeds, and draws share them out.
+    assert [stage.seeds_of(r) for r in stage.rows[3:]] == [(1,), (2,), (3,), (1,)]
+    assert stage.seeds_of("random@2") == stage.seeds_of("knn@2") == (1, 2, 3)
+
+
+def test_sets_of_contrasts_are_worked_on_and_none_twice() -> None:
+    contrast = {"a": "knn@2", "b": "reference", "pool": "paired", "variant": "relative"}
+    raw = changed(lambda r: r["stages"][0].update(contrasts=[contrast]))
+    cells = plan_from(raw).stages[0].cells()
+    assert cells[-1] == ("paired", "relative", "reference")
+    assert len(set(cells)) == len(cells) == 8
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda r: r.pop("pools"), "plan: no key 'pools'"),
+        (lambda r: r.update(speed=3), "unknown key 'speed'; known are name, question"),
+        (lambda r: r.update(name="a/b"), "name 'a/b'"),
+        (lambda r: r.update(scorers=["knm"]), "no scorer 'knm'"),
+        (lambda r: r.update(scorers="knn"), "scorers is 'knn', expected a list of names"),
+        (lambda r: r["stages"][0].pop("seeds"), "stage: no key 'seeds'"),
+        (lambda r: r["stages"][0].update(seeds=[1, 1]), "expected some, each once"),
+        (lambda r: r["stages"][0].update(kind="final"), "kind 'final' is none of protocol"),
+        (lambda r: r["stages"][0].update(pools=["other"]), "no pool 'other'; there are paired"),
+        (lambda r: r["stages"][0].update(rows=["knn@5"]), "keeps more than the 4 of paired"),
+        (lambda r: r["stages"][0].update(rows=["entropy@2"]), "entropy is none of the scorers"),
+        (lambda r: r["stages"][0].update(rows=[3]), "row 3: expected a text"),
+        (lambda r: r["stages"].append(r["stages"][0]), "a name is there twice"),
+        (lambda r: r["stages"][0].update(contrasts=[{"a": "oracle"}]), "contrast: no key 'b'"),
+        (lambda r: r["stages"][0].update(draw_seeds=4), "draw_seeds 4 of 3 seeds"),
+        (lambda r: r["stages"][0].update(rows=["more@2"]), "the plan has no dataset 'more'"),
+        (
+            lambda r: (r.update(more={"episodes": 2}), r["stages"][0].update(rows=["more@3"])),
+            "keeps more than the 2 of more",
+        ),
+        (lambda r: r["pools"].update(more={"episodes": 2}), "a pool cannot be called 'more'"),
+    ],
+)
+def test_plans_that_make_no_sense_are_refused(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], said: str
+) -> None:
+    path = tmp_path / "plan.yaml"
+    path.write_text(yaml.safe_dump(changed(change)))
+    with pytest.raises(ConfigError, match=said) as caught:
+        read_plan(path)
+    assert str(path) in str(caught.value)
+
+
+def test_more_contrasts_than_were_to_be_planned_are_refused() -> None:
+    one = {"a": "oracle", "b": "everything", "pool": "paired", "variant": "relative"}
+    with pytest.raises(ConfigError, match="13 contrasts, at most 12"):
+        plan_from(changed(lambda r: r["stages"][0].update(contrasts=[one] * 13)))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("a: [", "line 1: not YAML"), ("- 1", "expected a mapping"), (None, "No such file")],
+)
+def test_files_that_are_no_plan_are_named(tmp_path: Path, text: str | None, said: str) -> None:
+    path = tmp_path / "plan.yaml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ConfigError, match=said):
+        read_plan(path)
+
+
+def test_a_plan_without_scorers_takes_all() -> None:
+    assert plan_from(changed(lambda r: r.pop("scorers"))).scorers == tuple(SCORERS)
+
+
+def test_every_change_of_a_plan_changes_its_hash() -> None:
+    other = changed(lambda r: r["stages"][0].update(seeds=[1, 2, 4]))
+    assert plan_from(RAW).hash == plan_from(deepcopy(RAW)).hash != plan_from(other).hash
+
+
+def test_the_contrasts_of_salvage_are_twelve_and_the_margin_is_looked_for_before() -> None:
+    margins, confirmation = read_plan(CONFIG / "salvage.yaml").stages
+    assert (margins.kind, len(margins.contrasts)) == ("screen", 0)
+    assert (confirmation.kind, len(confirmation.contrasts)) == ("confirm", 12)
+    assert "official" not in margins.starts
+    # Contrasts add no training set to those that are listed; independent starts come first.
+    assert len(confirmation.cells()) == 4 * len(confirmation.rows)
+    pools = list(dict.fromkeys(pool for pool, _, _ in confirmation.cells()))
+    assert pools == ["independent_16", "independent_6", "paired_16", "paired_6"]
+
+
+def test_some_stages_of_a_plan_are_these_and_what_they_use() -> None:
+    plan = read_plan(CONFIG / "salvage.yaml")
+    some = plan.only(["margins"])
+    assert [stage.name for stage in some.stages] == ["margins"]
+    assert list(some.pools) == ["independent_16", "independent_6"]
+    assert some.hash == plan.hash
+    with pytest.raises(ConfigError, match="no stage 'margin'; there are margins, confirmation"):
+        plan.only(["margin"])
