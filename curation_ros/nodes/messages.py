@@ -1,4 +1,4 @@
-"""Plain data to ROS messages and back; the keys themselves live in `curation_ros.core.episode.status`."""
+"""Plain data to ROS messages and back; the keys live in `curation_ros.core.episode.status`."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Demonstrations without a graph: the sim node's episodes, stepped and recorded in one process.
 
-What steps (`sim_node.driving`), says (`sim_node.output`) and records (`curation_ros.live.recorder`)
-is what the nodes run; only the middleware in between is missing. So bags and truth have the form,
-and the values, of those that are recorded on the graph.
+Stepping (`sim_node.driving`), messages (`sim_node.output`) and recording
+(`curation_ros.live.recorder`) are what the nodes run; only the middleware in between is missing.
+So bags and truth have the form, and the values, of those that are recorded on the graph.
 """
 
 from __future__ import annotations
