@@ -23,8 +23,9 @@ from curation_ros.core.errors import ConfigError, CurationError, EpisodeError
 from curation_ros.core.evidence.length_control import MODES, LengthControl
 from curation_ros.core.scorers import SCORERS, Scorer
 from curation_ros.core.scorers.length import Length
-from curation_ros.core.statistics import detection
-from curation_ros.core.types import Floats
+from curation_ros.core.statistics import detection, length_confound
+from curation_ros.core.statistics.rank_correlation import rank_correlation
+from curation_ros.core.types import Floats, Mask
 from curation_ros.dataset.dataset import Dataset
 
 #: Field of the labels -> key in truth.jsonl, values that mean good, and what it says. For
@@ -184,7 +185,7 @@ def audit(
     raw = _fitted(settings, LengthControl("none"), trusted, everything)
     controlled = _fitted(settings, control, trusted, everything)
     lengths = np.array([len(e) for e in judged], dtype=np.float64)
-    identifiable = not detection.separates(lengths, good)
+    identifiable = not length_confound.separates(lengths, good)
     noted = dataset.start_of()
     starts = [_start(noted.get(e.id), e.id) for e in judged]
     other = "defect" if settings.labels == "success" else "success"
@@ -223,7 +224,7 @@ def _check_labels(
     dataset: Dataset,
     name: str,
     everything: Sequence[Episode],
-    good: detection.Flags,
+    good: Mask,
     unlabelled: int,
 ) -> None:
     if not everything:
@@ -343,7 +344,7 @@ class _Table:
     """
 
     settings: AuditSettings
-    good: detection.Flags
+    good: Mask
     lengths: Floats
     starts: Sequence[tuple[str, str]]
     identifiable: bool
@@ -390,14 +391,14 @@ class _Table:
             found |= self._permutations(scores.controlled, chosen, notes)
         return {**found, "notes": notes}
 
-    def _scored(self, scores: Sequence[float | None]) -> detection.Flags:
+    def _scored(self, scores: Sequence[float | None]) -> Mask:
         return np.array([s is not None for s in scores], dtype=np.bool_)
 
     def _values(self, scores: Sequence[float | None]) -> Floats:
         return np.array([s for s in scores if s is not None], dtype=np.float64)
 
     def _auroc(
-        self, scores: Sequence[float | None], chosen: detection.Flags, keys: tuple[str, str]
+        self, scores: Sequence[float | None], chosen: Mask, keys: tuple[str, str]
     ) -> dict[str, Any]:
         good = self.good[chosen]
         if not 0 < good.sum() < len(good):
@@ -407,13 +408,13 @@ class _Table:
         return dict(zip(keys, (estimate, list(interval)), strict=True))
 
     def _correlation(
-        self, scores: Sequence[float | None], chosen: detection.Flags, key: str
+        self, scores: Sequence[float | None], chosen: Mask, key: str
     ) -> dict[str, Any]:
-        found = detection.rank_correlation(self._values(scores), self.lengths[chosen])
+        found = rank_correlation(self._values(scores), self.lengths[chosen])
         return dict(zip((key, f"{key}_p"), found or (None, None), strict=True))
 
     def _at_the_top(
-        self, scores: Sequence[float | None], chosen: detection.Flags, notes: list[str]
+        self, scores: Sequence[float | None], chosen: Mask, notes: list[str]
     ) -> dict[str, Any]:
         """What is kept, the partial AUROC, and the interval over starts."""
         values, good = self._values(scores), self.good[chosen]
@@ -424,7 +425,7 @@ class _Table:
         if n_kept > len(good):
             notes.append(f"cannot keep {n_kept}: {len(good)} have a score")
         else:
-            kept = detection.kept(values, good, n_kept, n_good=int(self.good.sum()))
+            kept = detection.evaluate_kept(values, good, n_kept, n_good=int(self.good.sum()))
             found |= {
                 "n_kept": n_kept,
                 "precision": kept.precision,
@@ -447,7 +448,7 @@ class _Table:
         return found
 
     def _permutations(
-        self, scores: Sequence[float | None], chosen: detection.Flags, notes: list[str]
+        self, scores: Sequence[float | None], chosen: Mask, notes: list[str]
     ) -> dict[str, Any]:
         """The association with labels, length held, and with length, labels held."""
         values, good = self._values(scores), self.good[chosen]
@@ -458,13 +459,13 @@ class _Table:
         if not self.identifiable:
             notes.append("not identifiable at equal length: length separates the labels")
         else:
-            strata = detection.length_strata(lengths)
-            within = detection.label_test_within(values, good, strata, **draws)
+            strata = length_confound.length_strata(lengths)
+            within = length_confound.label_test_within(values, good, strata, **draws)
             if within is None:
                 notes.append("not identifiable at equal length: no stratum holds both labels")
         if within is not None:
             found |= {"auroc_within_length": within.value, "p_label_length_held": within.p}
-        follows = detection.correlation_test_within(values, lengths, good, **draws)
+        follows = length_confound.correlation_test_within(values, lengths, good, **draws)
         if follows is None:
             notes.append("within a label, the score or the length does not vary")
         else:
@@ -475,7 +476,7 @@ class _Table:
 def _notes(
     facts: Mapping[str, Any],
     lengths: Floats,
-    good: detection.Flags,
+    good: Mask,
     both: Sequence[tuple[bool, bool]],
     other: str,
     left: float | None,

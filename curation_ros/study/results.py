@@ -13,7 +13,10 @@ from typing import Any
 from curation_ros import __version__
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.scorers import SCORERS
-from curation_ros.core.statistics import policy_statistics as stats
+from curation_ros.core.statistics.rank_correlation import rank_correlation_exact
+from curation_ros.core.statistics.seeds import deviations, modes, seed_counts
+from curation_ros.core.statistics.significance import holm
+from curation_ros.core.statistics.success import contrast, gap_closed, success_rate
 from curation_ros.study.plan import Contrast, Stage, StudyPlan, parse_row
 from curation_ros.study.running import Cell, Study
 from curation_ros.study.units import Row
@@ -219,10 +222,10 @@ def _row(
         "is_degenerate": False,
     }
     if outcomes:
-        estimate = stats.success_rate(outcomes)
-        counts = stats.seed_counts(outcomes)
-        sd, population = stats.deviations([c.successes / c.n for c in counts])
-        found = stats.modes(counts)
+        estimate = success_rate(outcomes)
+        counts = seed_counts(outcomes)
+        sd, population = deviations([c.successes / c.n for c in counts])
+        found = modes(counts)
         row |= {
             "rate": estimate.value,
             "interval": estimate.interval,
@@ -270,7 +273,7 @@ def _compare(rows: list[Row]) -> None:
         base, best = rates.get("everything"), rates.get("oracle")
         row["gap_closed"] = None
         if row["rate"] is not None and base is not None and best is not None:
-            row["gap_closed"] = stats.gap_closed(row["rate"], base, best)
+            row["gap_closed"] = gap_closed(row["rate"], base, best)
         row["rival"] = None
         if not row["scorer"] or row["rate"] is None:
             continue
@@ -298,9 +301,7 @@ def _correlations(rows: Sequence[Row]) -> Iterable[Row]:
         if len({r["scorer"] for r in group}) < 3 or keep >= max(r["n_pool"] for r in rows):
             continue
         for against in ("auroc", "auroc_raw", "n_good"):
-            found = stats.rank_correlation_exact(
-                [r[against] for r in group], [r["rate"] for r in group]
-            )
+            found = rank_correlation_exact([r[against] for r in group], [r["rate"] for r in group])
             yield {
                 "pool": pool,
                 "variant": variant,
@@ -335,7 +336,7 @@ def _contrasts(
         }
         p_values[str(k)] = None
         if outcomes[a].keys() & outcomes[b].keys():
-            made = stats.contrast(outcomes[a], outcomes[b])
+            made = contrast(outcomes[a], outcomes[b])
             p_values[str(k)] = made.p
             row |= {
                 "value": made.estimate.value,
@@ -350,7 +351,7 @@ def _contrasts(
                 "minimum_detectable": made.minimum_detectable,
             }
         found.append(row)
-    adjusted = stats.holm(p_values, len(planned)) if planned else {}
+    adjusted = holm(p_values, len(planned)) if planned else {}
     for k, row in enumerate(found):
         row["p_holm"] = adjusted.get(str(k))
     return found

@@ -1,1 +1,1 @@
-"""Statistics of scores and of policies: detection, intervals, contrasts."""
+"""Statistics of scores and of policies."""

@@ -24,7 +24,7 @@ def _check(successes: int, n: int, confidence: float) -> tuple[int, int]:
 
 
 def wilson(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval: good on average, the one to show.
+    """Wilson's score interval: its coverage is right on average, so this is the one to show.
 
     Args:
         successes: number of successes.
@@ -32,10 +32,11 @@ def wilson(successes: int, n: int, confidence: float = 0.95) -> tuple[float, flo
         confidence: nominal coverage, between 0 and 1.
 
     Returns:
-        Lower and upper bound; exactly 0 at no success and exactly 1 at no failure.
+        Lower and upper bound. The lower is exactly 0 without a success. The upper is exactly 1
+        without a failure.
 
     Raises:
-        ConfigError: if the numbers make no sense.
+        ConfigError: if a number is out of range.
 
     Source: Wilson, JASA 22:209-212, 1927.
     """
@@ -50,7 +51,7 @@ def wilson(successes: int, n: int, confidence: float = 0.95) -> tuple[float, flo
 
 
 def clopper_pearson(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Clopper and Pearson's exact interval: covers at least as often as it says.
+    """Clopper and Pearson's exact interval: its coverage is never below the nominal one.
 
     Args:
         successes: number of successes.
@@ -61,7 +62,7 @@ def clopper_pearson(successes: int, n: int, confidence: float = 0.95) -> tuple[f
         Lower and upper bound.
 
     Raises:
-        ConfigError: if the numbers make no sense.
+        ConfigError: if a number is out of range.
 
     Source: Clopper, Pearson, Biometrika 26:404-413, 1934.
     """
