@@ -1,3 +1,5 @@
 """Record, curate and judge robot demonstrations on a ROS 2 graph."""
 
-__version__ = "0.1.0"
+from curation_ros.version import __version__
+
+__all__ = ["__version__"]

@@ -14,12 +14,12 @@ from datetime import datetime, timezone
 import numpy as np
 import torch
 
-import curation_ros
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.identity import new_episode_id
 from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.errors import PolicyError
 from curation_ros.core.types import Floats, Span
+from curation_ros.version import __version__
 from policy_node.action import N_OUTPUTS, ActionSpec
 from policy_node.observation import ObservationSpec
 from policy_node.policy import Card, Policy, Weights, standardise
@@ -259,7 +259,7 @@ def trained_policy(
             "python": platform.python_version(),
             "numpy": np.__version__,
             "torch": torch.__version__,
-            "curation_ros": curation_ros.__version__,
+            "curation_ros": __version__,
         },
     )
     weights = [(_array(layer.weight), _array(layer.bias)) for layer in linear_layers(network)]

@@ -14,13 +14,13 @@ from typing import IO, Any, Literal, cast
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
-from curation_ros import __version__
 from curation_ros.bags.mcap_file import OWN_METADATA
 from curation_ros.bags.qos import QosProfile, qos_to_yaml
 from curation_ros.bags.schemas import MessageSchema, message_schema
 from curation_ros.bags.yaml_text import dump_yaml
 from curation_ros.core.errors import BagError
 from curation_ros.files import sync_folder
+from curation_ros.version import __version__
 
 #: Bytes of messages after which a chunk is written without being asked to flush.
 CHUNK_BYTES = 256 * 1024

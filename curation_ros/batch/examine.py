@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from curation_ros import __version__
 from curation_ros.bags.reader import read_episode
 from curation_ros.batch.workers import WorkerDiedError, check_workers, spread
 from curation_ros.core.decision.curation import Curation
@@ -27,6 +26,7 @@ from curation_ros.core.episode.findings import Finding
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import CurationError
 from curation_ros.dataset.index import Index
+from curation_ros.version import __version__
 
 # Bags that a worker gets at once: a fitted curation of some 100 kB goes with them.
 _BATCH = 16

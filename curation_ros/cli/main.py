@@ -8,8 +8,8 @@ import os
 import sys
 from collections.abc import Sequence
 
-from curation_ros import __version__
 from curation_ros.core.errors import ConfigError, CurationError
+from curation_ros.version import __version__
 
 #: Subcommand -> (module, one line of help). The only list; modules are imported when used, so
 #: that `curation score` needs no torch and `curation train` no ROS.

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Literal
 
-from curation_ros import __version__
 from curation_ros.bags.qos import QosProfile
 from curation_ros.bags.reader import open_bag
 from curation_ros.bags.recovery import recover_bag
@@ -22,6 +21,7 @@ from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import BagError, CurationError
 from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.version import __version__
 
 _LOCK = ".lock"
 _SPACE_PERIOD_S = 1.0

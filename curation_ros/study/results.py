@@ -10,7 +10,6 @@ from datetime import datetime, timezone
 from statistics import mean
 from typing import Any
 
-from curation_ros import __version__
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.scorers import SCORERS
 from curation_ros.core.statistics.rank_correlation import rank_correlation_exact
@@ -20,6 +19,7 @@ from curation_ros.core.statistics.success import contrast, gap_closed, success_r
 from curation_ros.study.plan import Contrast, Stage, StudyPlan, parse_row
 from curation_ros.study.running import Cell, Study
 from curation_ros.study.units import Row
+from curation_ros.version import __version__
 
 #: Raised when a key changes its meaning.
 FORMAT = 1
