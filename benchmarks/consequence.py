@@ -153,11 +153,11 @@ def _of(carrying: Carrying) -> Verdict:
 def _of_events(episode: Episode) -> Verdict:
     scorer = SCORERS["phase_events"]()
     try:
-        is_lost = scorer.score(episode) < 1.0 - scorer.resolution
-        location = scorer.location(episode)
+        look = scorer.look(episode)
     except Abstain:
         return Verdict(None)
-    return Verdict(is_lost, location[0] if location is not None else None)
+    is_lost = look.score < 1.0 - scorer.resolution
+    return Verdict(is_lost, look.steps[0] if look.steps is not None else None)
 
 
 #: What is given -> what a detector makes of an episode.

@@ -253,7 +253,8 @@ def scorer_text(name: str, kind: type[Scorer], cost: dict[str, str]) -> str:
         "Source",
     )
     lies = LIES[twin] + (_OF_REFERENCE.get(name, ()) if name == twin else _TWINS)
-    score = kind._judge if issubclass(kind, PoolScorer) else kind.score
+    score = kind._score_features if issubclass(kind, PoolScorer) else kind.look
+    what, _, _ = (inspect.getdoc(score) or "").partition("\n\n")
     lines = [
         f"### {name}",
         prose(doc),
@@ -261,7 +262,7 @@ def scorer_text(name: str, kind: type[Scorer], cost: dict[str, str]) -> str:
             [
                 f"- **Formula**: `{FORMULAS[twin]}`"
                 + (", over the episodes of other starts" if name != twin else ""),
-                f"- **Score**: {' '.join((score.__doc__ or '').split())}",
+                f"- **Score**: {' '.join(what.split())}",
                 *([f"- **Source**: {source}"] if source else []),
                 f"- **Needs**: {needs}",
                 f"- **Oriented by**: {ORIENTS[scorer.needs]}",

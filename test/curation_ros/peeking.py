@@ -6,7 +6,7 @@ import inspect
 from pathlib import Path
 
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.scorers import Scorer
+from curation_ros.core.scorers import Look, Scorer
 from curation_ros.dataset.dataset import Dataset
 
 
@@ -15,10 +15,10 @@ class Peeker(Scorer):
 
     needs = "nothing"
 
-    def score(self, episode: Episode) -> float:
+    def look(self, episode: Episode) -> Look:
         """Read the truth of the dataset that the bag lies in."""
         truth = Dataset(bag_being_read().resolve().parents[1]).truth()
-        return float(truth.get(episode.id, {}).get("outcome") == "succeeded")
+        return Look(float(truth.get(episode.id, {}).get("outcome") == "succeeded"))
 
 
 def bag_being_read() -> Path:

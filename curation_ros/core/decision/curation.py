@@ -21,7 +21,7 @@ from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
 from curation_ros.core.evidence.checks import Baseline, check_episode
 from curation_ros.core.evidence.gripper import gripper_findings
 from curation_ros.core.evidence.length_control import LengthControl
-from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, PoolScorer, Scorer
+from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, Look, PoolScorer, Scorer
 from curation_ros.core.scorers.features import phase_name
 
 if TYPE_CHECKING:
@@ -392,26 +392,39 @@ class Curation:
         Raises:
             NotFittedError: before `fit`.
         """
+        looks, abstained, _ = self._looks(episode)
+        return self._scores(looks), abstained
+
+    def _scores(self, looks: Mapping[str, Look]) -> dict[str, float | None]:
+        """Scorer -> score, None where it abstained."""
+        return {
+            name: float(looks[name].score) if name in looks else None for name in self.scorers_
+        }
+
+    def _looks(
+        self, episode: Episode
+    ) -> tuple[dict[str, Look], dict[str, str], dict[str, Episode]]:
+        """Ask every scorer once: scorer -> its look, else why it abstained; and what it saw."""
         self._check_fitted()
         view, no_view = self._view(episode)
-        scores: dict[str, float | None] = {}
+        looks: dict[str, Look] = {}
         abstained: dict[str, str] = {}
+        views: dict[str, Episode] = {}
         for name, scorer in self.scorers_.items():
-            scores[name] = None
             shown = view if scorer.length_controlled else episode
             if name in self.unfitted_ or shown is None:
                 abstained[name] = self.unfitted_.get(name, no_view)
                 continue
             try:
-                score = float(scorer.score(shown))
+                look = scorer.look(shown)
             except EpisodeError as err:  # Abstain is one
                 abstained[name] = str(err)
                 continue
-            if math.isfinite(score):
-                scores[name] = score
+            if math.isfinite(look.score):
+                looks[name], views[name] = look, shown
             else:
-                abstained[name] = f"its score is {score}"
-        return scores, abstained
+                abstained[name] = f"its score is {look.score}"
+        return looks, abstained, views
 
     def _view(self, episode: Episode) -> tuple[Episode | None, str]:
         """The episode under length control, or why there is none."""
@@ -428,17 +441,31 @@ class Curation:
         """
         self._check_fitted()
         findings = self._findings(episode)
-        scores, abstained, words, seen = self._look(episode)
+        looks, abstained, views = self._looks(episode)
         part = None
         kept = sound_part(episode, untrustworthy(findings))
         if kept is not None:
             rest = episode.steps(kept[1] + 1, kept[0])
             less = untrustworthy(self._findings(rest))
             if all(f.id in {g.id for g in findings} for f in less):
-                some, silent, said, _ = self._look(rest)
+                some, silent, _ = self._looks(rest)
                 cut = untrustworthy(findings)[0]
-                part = Part(episode.span(*kept), f"{cut.id}: {cut.message}", some, silent, said)
+                part = Part(
+                    episode.span(*kept),
+                    f"{cut.id}: {cut.message}",
+                    self._scores(some),
+                    silent,
+                    _explanations(some),
+                )
         evidence: dict[str, Any] = {"length_steps": self.length_.steps_}
+        seen = {
+            name: {
+                "span": list(views[name].span(*look.steps)),
+                "phase": phase_name(views[name], look.steps[0]),
+            }
+            for name, look in looks.items()
+            if look.steps is not None
+        }
         if seen:
             evidence["seen"] = seen
         return Examination(
@@ -446,14 +473,14 @@ class Curation:
             name=episode.name,
             steps=len(episode),
             span=(0, max(0, episode.end_ns - episode.start_ns)),
-            scores=scores,
+            scores=self._scores(looks),
             abstained=abstained,
-            words=words,
+            words=_explanations(looks),
             findings=findings,
             evidence=evidence,
             content=episode.content_digest,
             part=part,
-            breaks=self._breaks(episode, abstained),
+            breaks=self._breaks(episode, looks),
         )
 
     def _findings(self, episode: Episode) -> tuple[Finding, ...]:
@@ -464,36 +491,14 @@ class Curation:
             known.update(_BY_GRIPPER)
         return (*episode.findings, *(f for f in seen if f.id not in known))
 
-    def _look(
-        self, episode: Episode
-    ) -> tuple[dict[str, float | None], dict[str, str], dict[str, str], dict[str, Any]]:
-        """Scores, why some are missing, what scorers say, and where they look."""
-        scores, abstained = self.score(episode)
-        words: dict[str, str] = {}
-        seen: dict[str, dict[str, Any]] = {}
-        view, _ = self._view(episode)
-        for name, scorer in self.scorers_.items():
-            shown = view if scorer.length_controlled else episode
-            if name in abstained or shown is None:
-                continue
-            text, steps = scorer.explain(shown), scorer.location(shown)
-            if text is not None:
-                words[name] = text
-            if steps is not None:
-                seen[name] = {
-                    "span": list(shown.span(*steps)),
-                    "phase": phase_name(shown, steps[0]),
-                }
-        return scores, abstained, words, seen
-
-    def _breaks(self, episode: Episode, abstained: Mapping[str, str]) -> dict[str, Break]:
+    def _breaks(self, episode: Episode, looks: Mapping[str, Look]) -> dict[str, Break]:
         """Where scorers see the whole episode break."""
         found: dict[str, Break] = {}
         margin_s = self.salvage_margin_s
-        for name, scorer in self.scorers_.items():
-            if margin_s is None or name in abstained or scorer.length_controlled:
+        for name, look in looks.items():
+            if margin_s is None or self.scorers_[name].length_controlled:
                 continue
-            step = scorer.broke_at(episode)
+            step = look.broke_at
             if step is not None:
                 kept = good_prefix(episode, step, margin_s)
                 at_ns = int(episode.stamps_ns[step]) - episode.start_ns
@@ -614,6 +619,11 @@ class Curation:
         else:
             lines.append(f"rule {self.rule}: review: {self.ruling_.no_rule}")
         return "\n".join(lines)
+
+
+def _explanations(looks: Mapping[str, Look]) -> dict[str, str]:
+    """Scorer -> its explanation, where it has one."""
+    return {n: look.explanation for n, look in looks.items() if look.explanation is not None}
 
 
 def _seen(what: str, scores: Mapping[str, float]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -125,6 +125,11 @@ class Episode:
     def action(self) -> Floats:
         """(T, A) action, as the topic map declares it; read-only, as every scorer shares it."""
         return _read_only(self.columns(self.topic_map.action))
+
+    @cached_property
+    def derived(self) -> dict[Callable[[Episode], Any], Any]:
+        """Measurements kept with the episode, by function; see `evidence.once`."""
+        return {}
 
     def steps(self, stop: int, start: int = 0) -> Episode:
         """The same episode with steps [start, stop) only; id, name and findings stay."""

@@ -6,14 +6,20 @@ tell, what the fingers hold; and, where the pose has not told it sooner, the com
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.evidence.carrying import GRASP_S, CarryWatch, Hold, carry_labels
+from curation_ros.core.evidence.carrying import (
+    GRASP_S,
+    CarryWatch,
+    Hold,
+    carry_labels,
+    watched,
+)
 from curation_ros.core.evidence.fingers import grip_of
 from curation_ros.core.evidence.gripper import commanded, contradiction
 from curation_ros.core.types import NS_PER_S
@@ -74,32 +80,40 @@ class AlertWatch:
     def all(self, episode: Episode) -> list[Finding]:
         """Everything that it could say by now, in the order in which it became sure."""
         self._watch.take(episode)
-        if any(f.id in _BLINDING for f in episode.findings):
-            return []
-        gaps = [f.span for f in episode.findings if f.id == "gap"]
-        found = [
-            (at, finding)
-            for at, since_ns, finding in (*self._by_pose(episode), *self._by_gripper(episode))
-            if not any(a <= finding.span[1] and b >= since_ns for a, b in gaps)
-        ]
-        return [finding for _, finding in sorted(found, key=lambda told: told[0])]
+        return _alerts(episode, self._watch.losses, self._watch.blind_from)
 
-    def _by_pose(self, episode: Episode) -> list[_Told]:
-        return [told for hold in self._watch.losses for told in _lost(hold, episode)]
 
-    def _by_gripper(self, episode: Episode) -> list[_Told]:
-        found = []
-        blind_from = self._watch.blind_from
-        if blind_from is not None:
-            # Without phases nobody says that every closing was to hold something.
-            states = ("broken", "never") if carry_labels(episode.topic_map) else ("broken",)
-            holds = [h for h in grip_of(episode).holds if h.state in states]
-            for told in (t for hold in holds for t in _lost(hold, episode, by_grip=True)):
-                found.append((max(told[0], blind_from), *told[1:]))
-        found += _opened(episode)
-        # Of what was known by then: without a meaning, neither command nor width tell anything.
-        with np.errstate(invalid="ignore", over="ignore"):
-            return [t for t in found if contradiction(episode.steps(t[0] + 1)) is None]
+def alerts_of(episode: Episode) -> list[Finding]:
+    """Every alert of a whole episode, in the order in which it became sure."""
+    seen = watched(episode)
+    return _alerts(episode, seen.losses, seen.blind_from)
+
+
+def _alerts(episode: Episode, losses: Sequence[Hold], blind_from: int | None) -> list[Finding]:
+    if any(f.id in _BLINDING for f in episode.findings):
+        return []
+    gaps = [f.span for f in episode.findings if f.id == "gap"]
+    by_pose = [told for hold in losses for told in _lost(hold, episode)]
+    found = [
+        (at, finding)
+        for at, since_ns, finding in (*by_pose, *_by_gripper(episode, blind_from))
+        if not any(a <= finding.span[1] and b >= since_ns for a, b in gaps)
+    ]
+    return [finding for _, finding in sorted(found, key=lambda told: told[0])]
+
+
+def _by_gripper(episode: Episode, blind_from: int | None) -> list[_Told]:
+    found = []
+    if blind_from is not None:
+        # Without phases nobody says that every closing was to hold something.
+        states = ("broken", "never") if carry_labels(episode.topic_map) else ("broken",)
+        holds = [h for h in grip_of(episode).holds if h.state in states]
+        for told in (t for hold in holds for t in _lost(hold, episode, by_grip=True)):
+            found.append((max(told[0], blind_from), *told[1:]))
+    found += _opened(episode)
+    # Of what was known by then: without a meaning, neither command nor width tell anything.
+    with np.errstate(invalid="ignore", over="ignore"):
+        return [t for t in found if contradiction(episode.steps(t[0] + 1)) is None]
 
 
 def _lost(hold: Hold, episode: Episode, *, by_grip: bool = False) -> list[_Told]:

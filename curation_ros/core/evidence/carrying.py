@@ -22,6 +22,7 @@ import numpy as np
 
 from curation_ros.core.errors import EpisodeError
 from curation_ros.core.evidence.gripper import commanded
+from curation_ros.core.evidence.once import once_per_episode
 from curation_ros.core.types import NS_PER_S, Mask
 
 if TYPE_CHECKING:
@@ -154,9 +155,32 @@ class Carrying:
         return sum(h.n_carried for h in self.holds) / steps if steps else float("nan")
 
 
+@dataclass(frozen=True)
+class Watched:
+    """What a watch says of a whole episode.
+
+    Attributes:
+        carrying: what became of everything that was grasped.
+        losses: see `CarryWatch.losses`.
+        blind_from: see `CarryWatch`.
+    """
+
+    carrying: Carrying
+    losses: tuple[Hold, ...]
+    blind_from: int | None
+
+
+@once_per_episode
+def watched(episode: Episode) -> Watched:
+    """Watch a whole episode."""
+    watch = CarryWatch(episode.topic_map).take(episode)
+    losses = tuple(watch.losses)  # before the watch ends what is still held
+    return Watched(watch.finish(), losses, watch.blind_from)
+
+
 def carrying_of(episode: Episode) -> Carrying:
     """What became of everything that was grasped in a whole episode."""
-    return CarryWatch(episode.topic_map).take(episode).finish()
+    return watched(episode).carrying
 
 
 def carry_labels(topic_map: TopicMap) -> dict[int, str]:
@@ -166,6 +190,7 @@ def carry_labels(topic_map: TopicMap) -> dict[int, str]:
     return {k: label for k, label in enumerate(labels) if label in CARRY_PHASES}
 
 
+@once_per_episode
 def carry_steps(episode: Episode) -> tuple[Mask, Mask]:
     """In which steps something is to be carried, and in which that is not known.
 

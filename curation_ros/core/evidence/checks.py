@@ -15,7 +15,7 @@ import numpy as np
 
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.evidence.alerts import LOST, AlertWatch
+from curation_ros.core.evidence.alerts import LOST, alerts_of
 from curation_ros.core.evidence.gripper import first_opening, is_closed_command, is_open_command
 from curation_ros.core.types import NS_PER_S
 
@@ -180,7 +180,7 @@ class _Facts:
             held_s=(
                 0.0 if opening is None else float(times_s[opening] - times_s[int(closed.argmax())])
             ),
-            alarming=AlertWatch(episode.topic_map).all(episode),
+            alarming=alerts_of(episode),
         )
 
     @property

@@ -15,6 +15,7 @@ import numpy as np
 from curation_ros.core.errors import EpisodeError
 from curation_ros.core.evidence.carrying import GRASP_S, Carrying, Hold, carry_labels, carry_steps
 from curation_ros.core.evidence.gripper import commanded, finger_width
+from curation_ros.core.evidence.once import once_per_episode
 from curation_ros.core.types import NS_PER_S, Mask
 
 if TYPE_CHECKING:
@@ -46,6 +47,15 @@ def grip_of(episode: Episode, *, effort: str = "") -> Carrying:
         Holds whose object is the field that was read; `gap_m` is how much wider the gap was when
         that was noticed than at its narrowest, or for effort 0.
     """
+    return _grip_by(episode, effort) if effort else _grip_by_gap(episode)
+
+
+@once_per_episode
+def _grip_by_gap(episode: Episode) -> Carrying:
+    return _grip_by(episode, "")
+
+
+def _grip_by(episode: Episode, effort: str) -> Carrying:
     try:
         held, blind = carry_steps(episode)
         is_open = _is_open(episode)

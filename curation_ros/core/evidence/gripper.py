@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.errors import EpisodeError
+from curation_ros.core.evidence.once import once_per_episode
 from curation_ros.core.types import NS_PER_S
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ def _held(sign: npt.NDArray[np.int8]) -> npt.NDArray[np.int8]:
     return held
 
 
+@once_per_episode
 def commanded(episode: Episode) -> npt.NDArray[np.int8]:
     """(T,) what the gripper is commanded to be: +1 open, -1 closed, 0 nothing commanded yet.
 
@@ -117,6 +119,7 @@ def first_opening(episode: Episode) -> int | None:
     return opening_of(commanded(episode))
 
 
+@once_per_episode
 def finger_width(episode: Episode) -> Floats | None:
     """(T,) distance between the fingers in the field's unit, larger when open.
 
@@ -163,6 +166,7 @@ def first_finger_opening(episode: Episode) -> int | None:
     return None if width is None else opening_of(_width_state(width))
 
 
+@once_per_episode
 def contradiction(episode: Episode) -> str | None:
     """Whether the data contradict the declared meaning of the command, in one sentence.
 

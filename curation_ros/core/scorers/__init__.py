@@ -12,14 +12,14 @@ from curation_ros.core.scorers.length import Length
 from curation_ros.core.scorers.object_coupling import ObjectCoupling
 from curation_ros.core.scorers.phase_events import PhaseEvents
 from curation_ros.core.scorers.pool import PoolScorer
-from curation_ros.core.scorers.scorer import Abstain, Need, Scorer
+from curation_ros.core.scorers.scorer import Abstain, Look, Need, Scorer
 from curation_ros.core.scorers.smoothness import Smoothness
 from curation_ros.core.scorers.trajectory_alignment import (
     LabelFreeTrajectoryAlignment,
     TrajectoryAlignment,
 )
 
-__all__ = ["DEFAULT_SCORERS", "SCORERS", "Abstain", "Need", "PoolScorer", "Scorer"]
+__all__ = ["DEFAULT_SCORERS", "SCORERS", "Abstain", "Look", "Need", "PoolScorer", "Scorer"]
 
 #: Name -> class: those of the paper in its order, the baseline, those of what became of the
 #: object, the label-free twins.

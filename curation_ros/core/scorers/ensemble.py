@@ -9,7 +9,7 @@ import numpy as np
 
 from curation_ros.core.errors import ConfigError, EpisodeError
 from curation_ros.core.scorers.gripper_timing import GripperTiming
-from curation_ros.core.scorers.scorer import Abstain, Need, Scorer
+from curation_ros.core.scorers.scorer import Abstain, Look, Need, Scorer
 from curation_ros.core.scorers.smoothness import Smoothness
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class Ensemble(Scorer):
             self.scale_ = np.maximum(parts.std(axis=0), floor)
         return self
 
-    def score(self, episode: Episode) -> float:
+    def look(self, episode: Episode) -> Look:
         """The weighted sum, without unit."""
         self.check_params()
         if self.standardised:
@@ -102,7 +102,7 @@ class Ensemble(Scorer):
         parts = self._parts(episode)
         if self.standardised:
             parts = (parts - self.mean_) / self.scale_
-        return float(np.dot((self.smoothness_weight, self.gripper_weight), parts))
+        return Look(float(np.dot((self.smoothness_weight, self.gripper_weight), parts)))
 
     def _parts(self, episode: Episode) -> Floats:
         timing = GripperTiming(on=self.on)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from curation_ros.core.scorers.features import moving_action
-from curation_ros.core.scorers.scorer import Scorer
+from curation_ros.core.scorers.scorer import Look, Scorer
 
 if TYPE_CHECKING:
     from curation_ros.core.episode.episode import Episode
@@ -34,8 +34,9 @@ class Entropy(Scorer):
         self.over = over
         self.gripper_channel = gripper_channel
 
-    def score(self, episode: Episode) -> float:
+    def look(self, episode: Episode) -> Look:
         """0 for no spread, more negative for more; in the unit of the action."""
         self.check_params()
         action = moving_action(episode, gripper_channel=self.gripper_channel)
-        return -float(action.std(axis=0).mean() if self.over == "dimensions" else action.std())
+        spread = action.std(axis=0).mean() if self.over == "dimensions" else action.std()
+        return Look(-float(spread))

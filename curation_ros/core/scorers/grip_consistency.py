@@ -14,7 +14,7 @@ from curation_ros.core.scorers.object_coupling import (
     opened_too_early,
     seconds,
 )
-from curation_ros.core.scorers.scorer import Scorer
+from curation_ros.core.scorers.scorer import Look, Scorer
 
 if TYPE_CHECKING:
     from curation_ros.core.episode.episode import Episode
@@ -62,30 +62,29 @@ class GripConsistency(Scorer):
                 "field of the topic map with the efforts, with on: effort and only then"
             )
 
-    def score(self, episode: Episode) -> float:
-        """1: held all the way; less: let go or closed on nothing at that share; 0: never held."""
-        return self._grip(episode).coupling
+    def look(self, episode: Episode) -> Look:
+        """1: held all the way; less: let go or closed on nothing at that share; 0: never held.
 
-    def location(self, episode: Episode) -> tuple[int, int] | None:
-        """The first step without a grip and the one that makes it sure."""
-        return lost_steps(self._grip(episode))
-
-    def explain(self, episode: Episode) -> str | None:
-        """When and where the fingers held nothing any more."""
-        hold = self._grip(episode).worst
-        if hold is None or hold.departed is None:
-            return None
-        where = f", in {hold.phase}" if hold.phase else ""
-        return (
-            f"the fingers {'had let go' if hold.opened else 'held nothing'} at "
-            f"{seconds(episode, hold.departed):.2f} s{where}, as {hold.object} shows"
-        )
-
-    def broke_at(self, episode: Episode) -> int | None:
-        """The command to open, or the first step without a grip if that was before."""
-        return opened_too_early(episode, self._grip(episode))
-
-    def _grip(self, episode: Episode) -> Carrying:
+        The steps are the first one without a grip and the one that makes it sure.
+        """
         self.check_params()
         checked_command(episode)
-        return known(episode, grip_of(episode, effort=self.effort))
+        carrying = known(episode, grip_of(episode, effort=self.effort))
+        return Look(
+            carrying.coupling,
+            steps=lost_steps(carrying),
+            explanation=_explanation(episode, carrying),
+            broke_at=opened_too_early(episode, carrying),
+        )
+
+
+def _explanation(episode: Episode, carrying: Carrying) -> str | None:
+    """When and where the fingers held nothing any more."""
+    hold = carrying.worst
+    if hold is None or hold.departed is None:
+        return None
+    where = f", in {hold.phase}" if hold.phase else ""
+    return (
+        f"the fingers {'had let go' if hold.opened else 'held nothing'} at "
+        f"{seconds(episode, hold.departed):.2f} s{where}, as {hold.object} shows"
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from curation_ros.core.errors import EpisodeError
 from curation_ros.core.evidence import gripper
 from curation_ros.core.scorers.features import checked_command, phase_name
-from curation_ros.core.scorers.scorer import Abstain, Scorer
+from curation_ros.core.scorers.scorer import Abstain, Look, Scorer
 from curation_ros.core.types import NS_PER_S
 
 if TYPE_CHECKING:
@@ -63,23 +63,21 @@ class GripperTiming(Scorer):
         self.earliest_opening_s_: float | None = min(opened or ended, default=None)
         return self
 
-    def score(self, episode: Episode) -> float:
-        """From 0 (opened at once) to 1 (never opened again)."""
-        step = self._opening(episode)
-        if step is None and self.never == "abstain":
-            raise Abstain("the gripper never opened again")
-        return 1.0 if step is None else step / len(episode)
+    def look(self, episode: Episode) -> Look:
+        """From 0 (opened at once) to 1 (never opened again).
 
-    def location(self, episode: Episode) -> tuple[int, int] | None:
-        """The step of the opening."""
-        step = self._opening(episode)
-        return None if step is None else (step, step)
-
-    def explain(self, episode: Episode) -> str | None:
-        """When and in which phase it opened, and when the reference does."""
+        The step is that of the opening.
+        """
         step = self._opening(episode)
         if step is None:
-            return None
+            if self.never == "abstain":
+                raise Abstain("the gripper never opened again")
+            return Look(1.0)
+        explanation = self._explanation(episode, step)
+        return Look(step / len(episode), steps=(step, step), explanation=explanation)
+
+    def _explanation(self, episode: Episode, step: int) -> str:
+        """When and in which phase it opened, and when the reference does."""
         opened_s, phase = _seconds(episode, step), phase_name(episode, step)
         text = f"the gripper opened at {opened_s:.1f} s" + (f", in {phase}" if phase else "")
         earliest_s: float | None = getattr(self, "earliest_opening_s_", None)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from curation_ros.core.errors import ConfigError, EpisodeError
 from curation_ros.core.scorers.features import check_width, moving_action, reference_features
 from curation_ros.core.scorers.pool import PoolScorer, outside
-from curation_ros.core.scorers.scorer import Abstain, Scorer
+from curation_ros.core.scorers.scorer import Abstain, Look, Scorer
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -175,12 +175,12 @@ class IsolationForest(Scorer):
         self.n_features_ = table.shape[1]
         return self
 
-    def score(self, episode: Episode) -> float:
+    def look(self, episode: Episode) -> Look:
         """Between -1 and 0; an episode that nothing tells from the reference is near -0.4."""
         self._check_fitted()
         row = _features(episode, self.of)
         check_width(len(row), self.n_features_, "features of the action")
-        return self.forest_.score(row)
+        return Look(self.forest_.score(row))
 
 
 class LabelFreeIsolationForest(PoolScorer):
@@ -239,7 +239,7 @@ class LabelFreeIsolationForest(PoolScorer):
             for mask in outside(fold)
         )
 
-    def _judge(self, features: Floats, model: int) -> float:
+    def _score_features(self, features: Floats, model: int) -> float:
         """Between -1 and 0; an episode that nothing tells from the others is near -0.4."""
         forest = self.forests_[model]
         assert forest is not None  # min_others >= 2

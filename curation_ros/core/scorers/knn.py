@@ -17,7 +17,7 @@ from curation_ros.core.scorers.features import (
     reference_features,
 )
 from curation_ros.core.scorers.pool import PoolScorer, outside
-from curation_ros.core.scorers.scorer import Abstain, Scorer
+from curation_ros.core.scorers.scorer import Abstain, Look, Scorer
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -102,7 +102,7 @@ class NearestNeighbours(Scorer):
         self.k_ = min(self.k, len(table))
         return self
 
-    def score(self, episode: Episode) -> float:
+    def look(self, episode: Episode) -> Look:
         """0 amid the reference, more negative further away; in standard deviations."""
         self._check_fitted()
         row = _features(episode)
@@ -113,7 +113,7 @@ class NearestNeighbours(Scorer):
         if len(others) < self.k and self.few == "abstain":
             raise Abstain(f"only {len(others)} of {self.k} neighbours")
         distance = np.linalg.norm(others - (row - self.mean_) / self.scale_, axis=1)
-        return -float(np.sort(distance)[: self.k].mean())
+        return Look(-float(np.sort(distance)[: self.k].mean()))
 
 
 class LabelFreeNearestNeighbours(PoolScorer):
@@ -169,7 +169,7 @@ class LabelFreeNearestNeighbours(PoolScorer):
         self.scale_ = np.array([scale for _, scale in scalings])
         self.table_ = features
 
-    def _judge(self, features: Floats, model: int) -> float:
+    def _score_features(self, features: Floats, model: int) -> float:
         """0 amid the others, more negative further away; in standard deviations."""
         # The mean cancels: only the scale is left in the difference of two standardised rows.
         apart = self.table_ - features

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from curation_ros.core.scorers.features import moving_action
-from curation_ros.core.scorers.scorer import Abstain, Scorer
+from curation_ros.core.scorers.scorer import Abstain, Look, Scorer
 
 if TYPE_CHECKING:
     from curation_ros.core.episode.episode import Episode
@@ -33,16 +33,16 @@ class Length(Scorer):
         self.of = of
         self.resolution = 0.01 if of == "path" else 1.0
 
-    def score(self, episode: Episode) -> float:
+    def look(self, episode: Episode) -> Look:
         """Negative number of steps, or negative path in the unit of the effector."""
         self.check_params()
         moving_action(episode)  # a recording that is broken or frozen has no meaningful length
         if self.of == "steps":
-            return -float(len(episode))
+            return Look(-float(len(episode)))
         effectors = episode.topic_map.with_role("effector")
         if not effectors:
             raise Abstain("the topic map declares no effector")
         path = episode.fields[effectors[0].name]
         if not np.isfinite(path).all():
             raise Abstain("the effector has values that are not finite")
-        return -float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+        return Look(-float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()))

@@ -10,7 +10,7 @@ from curation_ros.core.errors import EpisodeError
 from curation_ros.core.evidence.carrying import Carrying, Hold, carry_labels, carrying_of
 from curation_ros.core.evidence.gripper import commanded
 from curation_ros.core.scorers.features import checked_command
-from curation_ros.core.scorers.scorer import Abstain, Scorer
+from curation_ros.core.scorers.scorer import Abstain, Look, Scorer
 from curation_ros.core.types import NS_PER_S
 
 if TYPE_CHECKING:
@@ -45,37 +45,36 @@ class ObjectCoupling(Scorer):
     resolution = 0.02
     version = 2
 
-    def score(self, episode: Episode) -> float:
-        """1: carried all the way; less: it left at that share of the way; 0: never carried."""
-        return self._carrying(episode).coupling
+    def look(self, episode: Episode) -> Look:
+        """1: carried all the way; less: it left at that share of the way; 0: never carried.
 
-    def location(self, episode: Episode) -> tuple[int, int] | None:
-        """From the first step of leaving to the one that makes it sure."""
-        return lost_steps(self._carrying(episode))
-
-    def explain(self, episode: Episode) -> str | None:
-        """When and where it left the effector."""
-        hold = self._carrying(episode).worst
-        if hold is None or hold.departed is None or hold.noticed is None:
-            return None
-        where = f", in {hold.phase}" if hold.phase else ""
-        if hold.state == "never":
-            left_s = seconds(episode, hold.departed)
-            return f"{hold.object} was not taken along: left behind at {left_s:.2f} s{where}"
-        return (
-            f"{hold.object} left the effector at {seconds(episode, hold.departed):.2f} s{where}"
-            f"{', opened' if hold.opened else ''}; at {seconds(episode, hold.noticed):.2f} s it "
-            f"was {hold.gap_m:.3f} m farther away"
-        )
-
-    def broke_at(self, episode: Episode) -> int | None:
-        """The command to open, or the first step of leaving if that was before."""
-        return opened_too_early(episode, self._carrying(episode))
-
-    def _carrying(self, episode: Episode) -> Carrying:
+        The steps run from the first one of leaving to the one that makes it sure.
+        """
         if episode.topic_map.gripper is not None:
             checked_command(episode)
-        return known(episode, carrying_of(episode))
+        carrying = known(episode, carrying_of(episode))
+        return Look(
+            carrying.coupling,
+            steps=lost_steps(carrying),
+            explanation=_explanation(episode, carrying),
+            broke_at=opened_too_early(episode, carrying),
+        )
+
+
+def _explanation(episode: Episode, carrying: Carrying) -> str | None:
+    """When and where the object left the effector."""
+    hold = carrying.worst
+    if hold is None or hold.departed is None or hold.noticed is None:
+        return None
+    where = f", in {hold.phase}" if hold.phase else ""
+    if hold.state == "never":
+        left_s = seconds(episode, hold.departed)
+        return f"{hold.object} was not taken along: left behind at {left_s:.2f} s{where}"
+    return (
+        f"{hold.object} left the effector at {seconds(episode, hold.departed):.2f} s{where}"
+        f"{', opened' if hold.opened else ''}; at {seconds(episode, hold.noticed):.2f} s it "
+        f"was {hold.gap_m:.3f} m farther away"
+    )
 
 
 def known(episode: Episode, carrying: Carrying) -> Carrying:

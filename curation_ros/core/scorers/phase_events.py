@@ -10,7 +10,7 @@ from curation_ros.core.errors import ConfigError
 from curation_ros.core.evidence.carrying import carry_labels
 from curation_ros.core.scorers.features import checked_command
 from curation_ros.core.scorers.object_coupling import seconds
-from curation_ros.core.scorers.scorer import Abstain, Scorer
+from curation_ros.core.scorers.scorer import Abstain, Look, Scorer
 
 if TYPE_CHECKING:
     from curation_ros.core.episode.episode import Episode
@@ -48,32 +48,27 @@ class PhaseEvents(Scorer):
         if not (np.isfinite(self.softness) and self.softness > 0):
             raise ConfigError(f"PhaseEvents: expected softness > 0, found {self.softness}")
 
-    def score(self, episode: Episode) -> float:
-        """1: not opened in any of them; towards 0 the earlier it was opened in the worst."""
-        shares = np.array([share for share, _ in self._events(episode).values()])
-        return -self.softness * float(np.log(np.mean(np.exp(-shares / self.softness))))
+    def look(self, episode: Episode) -> Look:
+        """1: not opened in any of them; towards 0 the earlier it was opened in the worst.
 
-    def location(self, episode: Episode) -> tuple[int, int] | None:
-        """The step of the opening in the worst phase."""
-        _, step = min(self._events(episode).values(), key=lambda event: event[0])
-        return None if step is None else (step, step)
-
-    def explain(self, episode: Episode) -> str | None:
-        """In which phase it was opened, and after how much of it."""
+        The step is that of the opening in the worst phase; it broke at the first one in any.
+        """
         events = self._events(episode)
+        shares = np.array([share for share, _ in events.values()])
+        score = -self.softness * float(np.log(np.mean(np.exp(-shares / self.softness))))
         label = min(events, key=lambda name: events[name][0])
         share, step = events[label]
         if step is None:
-            return None
-        return (
-            f"the gripper was opened at {seconds(episode, step):.2f} s, "
-            f"after {share:.0%} of {label}"
+            return Look(score)
+        return Look(
+            score,
+            steps=(step, step),
+            explanation=(
+                f"the gripper was opened at {seconds(episode, step):.2f} s, "
+                f"after {share:.0%} of {label}"
+            ),
+            broke_at=min(at for _, at in events.values() if at is not None),
         )
-
-    def broke_at(self, episode: Episode) -> int | None:
-        """The first opening in any of them."""
-        steps = [step for _, step in self._events(episode).values() if step is not None]
-        return min(steps, default=None)
 
     def _events(self, episode: Episode) -> dict[str, tuple[float, int | None]]:
         """Phase -> share of it before the opening, and the step of that."""

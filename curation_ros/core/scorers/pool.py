@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
 from curation_ros.core.scorers.features import check_width, start_state
-from curation_ros.core.scorers.scorer import Abstain, Scorer
+from curation_ros.core.scorers.scorer import Abstain, Look, Scorer
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -64,7 +64,7 @@ class PoolScorer(Scorer):
         """Learn a model outside each fold and one of all, from (n, F) features."""
 
     @abstractmethod
-    def _judge(self, features: Floats, model: int) -> float:
+    def _score_features(self, features: Floats, model: int) -> float:
         """Score (F,) features by one of the models."""
 
     def check_params(self) -> None:
@@ -144,7 +144,7 @@ class PoolScorer(Scorer):
         self._learn(features, self.fold_)
         return self
 
-    def score(self, episode: Episode) -> float:
+    def look(self, episode: Episode) -> Look:
         """Score one episode by the dataset without its start."""
         self._check_fitted()
         features = self._features(episode)
@@ -161,7 +161,7 @@ class PoolScorer(Scorer):
                 f"the dataset has only {self.n_others_[model]} episodes of other starts, "
                 f"at least {self.min_others} are needed"
             )
-        return self._judge(features, model)
+        return Look(self._score_features(features, model))
 
     def _check_fitted(self) -> None:
         if not self.fitted():

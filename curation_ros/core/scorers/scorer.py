@@ -5,7 +5,8 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
 
@@ -22,12 +23,32 @@ class Abstain(EpisodeError):  # noqa: N818 - an answer of a scorer rather than a
     """A scorer cannot score this episode; the message is the short reason."""
 
 
-class Scorer(ABC):
-    """Judges one episode; **higher is better**, for every scorer.
+@dataclass(frozen=True)
+class Look:
+    """What one scorer finds in one episode.
 
-    Hyper-parameters are keyword-only and stored unchanged; what `fit` learns ends in `_`, and a
-    second `fit` forgets the first. `score` depends on the episode and the fitted state alone, and
-    changes neither. Labels have no way in: neither method has an argument for them.
+    Attributes:
+        score: higher is better; finite.
+        steps: first and last step that the score rests on; None where it rests on all alike.
+        explanation: one sentence for the operator; None where there is nothing to point out.
+        broke_at: step at which something went wrong that had been right until then, for a known
+            cause. The steps before it are a good demonstration of the beginning of the task.
+            None where nothing broke, or the cause may lie further back. Only asked of scorers
+            that see the whole episode.
+    """
+
+    score: float
+    steps: tuple[int, int] | None = None
+    explanation: str | None = None
+    broke_at: int | None = None
+
+
+class Scorer(ABC):
+    """Scores one episode; **higher is better**, for every scorer.
+
+    Hyper-parameters are keyword-only and stored unchanged. What `fit` learns ends in `_`, and a
+    second `fit` forgets the first. A look depends on the episode and the fitted state alone, and
+    changes neither. Labels have no way in: no method has an argument for them.
 
     Attributes:
         needs: what orients the score. Of an instance it may differ from its class (`ensemble`).
@@ -59,40 +80,23 @@ class Scorer(ABC):
         return self
 
     @abstractmethod
-    def score(self, episode: Episode) -> float:
-        """Score one episode; higher is better, always finite.
+    def look(self, episode: Episode) -> Look:
+        """Score one episode, and say where and why.
 
         Raises:
             Abstain: if the episode cannot be scored, with the reason.
             NotFittedError: if the scorer needs a reference and was not fitted.
         """
 
-    def location(self, episode: Episode) -> tuple[int, int] | None:
-        """First and last step that the score rests on, where it rests on any in particular.
+    @final
+    def score(self, episode: Episode) -> float:
+        """The score alone.
 
         Raises:
-            Abstain: as `score` does.
+            Abstain: as `look` does.
+            NotFittedError: as `look` does.
         """
-        return None
-
-    def explain(self, episode: Episode) -> str | None:
-        """What is to be seen in the episode, in words of an operator; None: nothing particular.
-
-        Raises:
-            Abstain: as `score` does.
-        """
-        return None
-
-    def broke_at(self, episode: Episode) -> int | None:
-        """Step at which something went wrong that was right until then, and nobody doubts why.
-
-        What was before it is a good demonstration of the beginning of the task. None: nothing
-        broke, or the cause may lie further back.
-
-        Raises:
-            Abstain: as `score` does.
-        """
-        return None
+        return self.look(episode).score
 
     def check_params(self) -> None:
         """Check the hyper-parameters; not done on construction, as scikit-learn has it.

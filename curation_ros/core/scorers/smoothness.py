@@ -9,7 +9,7 @@ from scipy import fft
 
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.scorers.features import moving_action
-from curation_ros.core.scorers.scorer import Abstain, Scorer
+from curation_ros.core.scorers.scorer import Abstain, Look, Scorer
 
 if TYPE_CHECKING:
     from curation_ros.core.episode.episode import Episode
@@ -116,16 +116,17 @@ class Smoothness(Scorer):
                 f"Smoothness: expected rate_hz > 0, or 0 for the episode's, found {self.rate_hz}"
             )
 
-    def score(self, episode: Episode) -> float:
+    def look(self, episode: Episode) -> Look:
         """0 is smoothest, more negative is jerkier."""
         self.check_params()
         action = moving_action(episode, gripper_channel=self.gripper_channel)
         if self.profile == "change":
             action = np.diff(action, axis=0)
-        return spectral_arc_length(
+        score = spectral_arc_length(
             np.linalg.norm(action, axis=1),
             self.rate_hz or episode.rate_hz,
             cutoff_hz=self.cutoff_hz,
             threshold=self.threshold,
             pad_level=self.pad_level,
         )
+        return Look(score)

@@ -16,7 +16,7 @@ from curation_ros.core.scorers.features import (
     reference_features,
 )
 from curation_ros.core.scorers.pool import PoolScorer, outside
-from curation_ros.core.scorers.scorer import Abstain, Scorer
+from curation_ros.core.scorers.scorer import Abstain, Look, Scorer
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -73,13 +73,13 @@ class TrajectoryAlignment(Scorer):
         self.mean_ = mean.reshape(n_steps, -1)
         return self
 
-    def score(self, episode: Episode) -> float:
+    def look(self, episode: Episode) -> Look:
         """1 for the same direction, 0 for a right angle, -1 for the opposite."""
         self._check_fitted()
         states = self._trajectory(episode)
         check_width(states.shape[1], self.mean_.shape[1], "columns of the state")
         n_steps = min(len(states), len(self.mean_))
-        return _cosine(states[:n_steps].ravel(), self.mean_[:n_steps].ravel())
+        return Look(_cosine(states[:n_steps].ravel(), self.mean_[:n_steps].ravel()))
 
     def _trajectory(self, episode: Episode) -> Floats:
         states = _moving_state(episode)
@@ -141,6 +141,6 @@ class LabelFreeTrajectoryAlignment(PoolScorer):
             [features[m].mean(axis=0) if m.any() else 0 * features[0] for m in outside(fold)]
         )
 
-    def _judge(self, features: Floats, model: int) -> float:
+    def _score_features(self, features: Floats, model: int) -> float:
         """1 for the same direction, 0 for a right angle, -1 for the opposite."""
         return _cosine(features, self.mean_[model])

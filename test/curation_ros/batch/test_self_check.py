@@ -17,7 +17,7 @@ from curation_ros.batch.self_check import IDENTITY, self_check, turned
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import CurationError
-from curation_ros.core.scorers import SCORERS
+from curation_ros.core.scorers import SCORERS, Look
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.live.curator import log_decision, override
 
@@ -42,20 +42,20 @@ TRUTH: dict[str, Any] = {
 class Listener(Peeker):
     """Follows what people have decided."""
 
-    def score(self, episode: Episode) -> float:
+    def look(self, episode: Episode) -> Look:
         """1.0 where the last line of the log is a keep."""
         log = Dataset(bag_being_read().resolve().parents[1]).decisions(episode.id)
-        return float(log[-1].verdict == "keep")
+        return Look(float(log[-1].verdict == "keep"))
 
 
 class Resolver(Peeker):
     """Follows links to the original, as far as they lead there."""
 
-    def score(self, episode: Episode) -> float:
+    def look(self, episode: Episode) -> Look:
         """As its parent, from where the bag's own file really is."""
         [file] = bag_being_read().glob("*.mcap")
         truth = Dataset(file.resolve().parents[2]).truth()
-        return float(truth.get(episode.id, {}).get("outcome") == "succeeded")
+        return Look(float(truth.get(episode.id, {}).get("outcome") == "succeeded"))
 
 
 @pytest.fixture

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from episodes import copied, make_episode, make_reference, shifted
+from episodes import copied, make_episode, make_reference, shifted, with_fields
 
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import Decision
@@ -18,7 +19,8 @@ from curation_ros.core.decision.rules import RULES
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
-from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS
+from curation_ros.core.evidence.carrying import CarryWatch
+from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, Look, Scorer
 
 ROOT = Path(__file__).resolve().parents[4]
 
@@ -488,3 +490,51 @@ def test_describe_says_what_scores_what_it_needs_and_the_threshold(
     assert "only 3 reference episodes" in text
     assert "keep where gripper_timing >= 0.937" in text
     assert "review: no reference" in Curation().fit([]).describe()
+
+
+def test_examine_asks_every_scorer_once_per_view(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    curation = Curation().fit(make_reference(rng))
+    asked: Counter[tuple[str, int]] = Counter()
+    for name, scorer in curation.scorers_.items():
+
+        def look(episode: Episode, name: str = name, scorer: Scorer = scorer) -> Look:
+            asked[name, len(episode)] += 1
+            return type(scorer).look(scorer, episode)
+
+        monkeypatch.setattr(scorer, "look", look)
+    whole = make_episode(rng, open_at=140)
+    curation.examine(whole)
+    assert {name for name, _ in asked} == set(curation.scorers_)
+    assert set(asked.values()) == {1}
+    asked.clear()
+    n = len(whole)
+    spoilt = whole.fields["twist"].copy()
+    spoilt[n - 20 :] = np.nan
+    fault = Finding("not-finite", "the twist ends in NaN", whole.span(n - 20, n - 1))
+    torn = replace(with_fields(whole, twist=spoilt), findings=(fault,))
+    part = curation.examine(torn).part
+    assert part is not None
+    of_whole_episodes = [k for k, s in curation.scorers_.items() if not s.length_controlled]
+    for name in of_whole_episodes:
+        assert asked[name, n] == asked[name, n - 20] == 1
+    assert sum(asked.values()) == 2 * len(curation.scorers_)
+
+
+def test_examine_watches_a_carry_once(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    curation = Curation().fit(make_reference(rng))
+    taken = []
+    take = CarryWatch.take
+
+    def counted(watch: CarryWatch, episode: Episode) -> CarryWatch:
+        taken.append(len(episode))
+        return take(watch, episode)
+
+    monkeypatch.setattr(CarryWatch, "take", counted)
+    episode = make_episode(rng, open_at=140)
+    found = curation.examine(episode)
+    assert found.scores["object_coupling"] is not None
+    assert taken == [len(episode)]

@@ -12,7 +12,7 @@ from scenes import LIFT, LIFT_AT, N_STEPS, RELEASE_AT, TRANSPORT, TRANSPORT_AT, 
 from curation_ros.bags.reader import read_episode
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.errors import ConfigError
-from curation_ros.core.scorers import SCORERS, Abstain
+from curation_ros.core.scorers import SCORERS, Abstain, Look
 from curation_ros.core.scorers.grip_consistency import GripConsistency
 from curation_ros.core.scorers.object_coupling import ObjectCoupling
 from curation_ros.core.scorers.phase_events import PhaseEvents
@@ -26,9 +26,7 @@ SAMPLE = Path(__file__).resolve().parents[4] / "bags" / "sample"
 def test_good_demonstration_scores_one_and_says_nothing(name: str) -> None:
     scorer = SCORERS[name]()
     for episode in (scene(), scene(tilt_rad=0.5), make_episode(), read_episode(SAMPLE)):
-        assert scorer.score(episode) == 1.0
-        assert scorer.location(episode) is None
-        assert scorer.explain(episode) is None
+        assert scorer.look(episode) == Look(1.0)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -46,8 +44,7 @@ def test_what_follows_the_release_changes_no_score(name: str) -> None:
     scorer = SCORERS[name]()
     for opened_at in (LIFT_AT + 20, RELEASE_AT):
         short, long = (scene(opened_at=opened_at, hover=n) for n in (0, 250))
-        assert scorer.score(short) == scorer.score(long)
-        assert scorer.explain(short) == scorer.explain(long)
+        assert scorer.look(short) == scorer.look(long)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -62,14 +59,14 @@ def test_object_coupling_by_hand() -> None:
     # At the 30th step it hangs 87 mm above where it stood, and cannot fall farther.
     episode, scorer = scene(opened_at=LIFT_AT + 30), ObjectCoupling()
     assert scorer.score(episode) == 30 / N_CARRY
-    assert scorer.location(episode) == (LIFT_AT + 30, LIFT_AT + 32)
-    assert scorer.explain(episode) == (
+    assert scorer.look(episode).steps == (LIFT_AT + 30, LIFT_AT + 32)
+    assert scorer.look(episode).explanation == (
         "bowl_position left the effector at 4.25 s, in LIFT, opened; at 4.35 s it was 0.096 m "
         "farther away"
     )
     behind = scene(is_taken=False, tremor_m=1e-5)
     assert scorer.score(behind) == 0.0
-    words = scorer.explain(behind)
+    words = scorer.look(behind).explanation
     assert words is not None
     assert words.startswith("bowl_position was not taken along: left behind at ")
 
@@ -77,13 +74,13 @@ def test_object_coupling_by_hand() -> None:
 def test_grip_consistency_by_hand() -> None:
     episode, scorer = scene(opened_at=LIFT_AT + 30), GripConsistency()
     assert scorer.score(episode) == 32 / N_CARRY  # the fingers follow two steps later
-    assert scorer.location(episode) == (LIFT_AT + 32, LIFT_AT + 33)
-    assert scorer.explain(episode) == (
+    assert scorer.look(episode).steps == (LIFT_AT + 32, LIFT_AT + 33)
+    assert scorer.look(episode).explanation == (
         "the fingers had let go at 4.35 s, in LIFT, as finger_position shows"
     )
     empty = np.where(episode.fields["finger_position"] == 0.0025, 0.0005, 0.04) * [1, -1]
     nothing = with_fields(scene(), finger_position=empty[:N_STEPS])
-    words = scorer.explain(nothing)
+    words = scorer.look(nothing).explanation
     assert words is not None
     assert words.startswith("the fingers held nothing at ")
 
@@ -93,8 +90,9 @@ def test_phase_events_by_hand() -> None:
     # TRANSPORT begins open because LIFT was left open: that is no second event.
     expected = -0.1 * np.log((np.exp(-(30 / LIFT) / 0.1) + np.exp(-1 / 0.1)) / 2)
     assert scorer.score(episode) == pytest.approx(expected, abs=1e-12)
-    assert scorer.location(episode) == (LIFT_AT + 30, LIFT_AT + 30)
-    assert scorer.explain(episode) == "the gripper was opened at 4.25 s, after 60% of LIFT"
+    assert scorer.look(episode).steps == (LIFT_AT + 30, LIFT_AT + 30)
+    explanation = "the gripper was opened at 4.25 s, after 60% of LIFT"
+    assert scorer.look(episode).explanation == explanation
     # Softer: nearer to the mean of both.
     assert PhaseEvents(softness=100.0).score(episode) == pytest.approx((0.6 + 1) / 2, abs=1e-3)
     # Harder: the worst alone, up to softness times the logarithm of two.

@@ -98,12 +98,12 @@ def test_score_is_a_finite_float_and_changes_nothing(
 ) -> None:
     episode = make_episode(rng)
     state, digest = state_bytes(fitted), episode.digest
-    first = fitted.score(episode)
-    fitted.location(episode)
-    fitted.explain(episode)
-    assert type(first) is float
-    assert np.isfinite(first)
-    assert fitted.score(episode) == first
+    first = fitted.look(episode)
+    assert type(first.score) is float
+    assert np.isfinite(first.score)
+    assert fitted.look(episode) == first
+    assert fitted.look(replace(episode)) == first  # nor does it rest on what was asked before
+    assert fitted.score(episode) == first.score
     assert state_bytes(fitted) == state
     assert episode.digest == digest
 
@@ -140,8 +140,7 @@ def test_shift_of_all_stamps_changes_nothing(
     episode = make_episode(rng)
     here = SCORERS[name]().fit(reference)
     there = SCORERS[name]().fit([shifted(e, HOUR_NS) for e in reference])
-    assert there.score(shifted(episode, HOUR_NS)) == here.score(episode)
-    assert there.explain(shifted(episode, HOUR_NS)) == here.explain(episode)
+    assert there.look(shifted(episode, HOUR_NS)) == here.look(episode)
 
 
 def test_live_equals_bag(fitted: Scorer, rng: np.random.Generator) -> None:
@@ -174,8 +173,8 @@ def test_live_equals_bag(fitted: Scorer, rng: np.random.Generator) -> None:
             )
         )
     seen = live.finish(made.end_ns, {})
-    assert fitted.score(seen) == fitted.score(bag.finish(made.end_ns, {}))
-    assert fitted.score(seen) == fitted.score(made)
+    assert fitted.look(seen) == fitted.look(bag.finish(made.end_ns, {}))
+    assert fitted.look(seen) == fitted.look(made)
 
 
 def degenerate(kind: str) -> Episode:
@@ -225,15 +224,29 @@ def test_shortest_episodes_score_or_abstain(
         assert n_steps < 5
 
 
-def test_location_lies_in_the_episode(fitted: Scorer, rng: np.random.Generator) -> None:
+def test_steps_of_a_look_lie_in_the_episode(
+    fitted: Scorer, name: str, rng: np.random.Generator
+) -> None:
     episode = make_episode(rng, open_at=140)
-    location = fitted.location(episode)
-    if location is not None:
-        assert 0 <= location[0] <= location[1] < len(episode)
+    look = fitted.look(episode)
+    if look.steps is not None:
+        assert 0 <= look.steps[0] <= look.steps[1] < len(episode)
+    if look.broke_at is not None:
+        assert 0 <= look.broke_at < len(episode)
+    assert look.explanation is None or look.explanation.strip()
+    if name in CONSEQUENCE:  # it was opened in LIFT
+        assert look.steps is not None
+        assert look.broke_at == 140
+        assert look.explanation is not None
+
+
+def test_subclasses_override_look_alone(name: str) -> None:
+    assert SCORERS[name].score is Scorer.score
+    assert SCORERS[name].look is not Scorer.look
 
 
 def test_labels_have_no_way_in(name: str) -> None:
-    assert list(inspect.signature(SCORERS[name].score).parameters) == ["self", "episode"]
+    assert list(inspect.signature(SCORERS[name].look).parameters) == ["self", "episode"]
     assert list(inspect.signature(SCORERS[name].fit).parameters) == ["self", "episodes"]
     known = {f.name for f in fields(Episode)}
     assert not known & {"success", "label", "labels", "outcome", "defect", "truth"}

@@ -224,8 +224,8 @@ def test_gripper_timing_does_not_see_the_motion(rng: np.random.Generator) -> Non
 
 def test_gripper_timing_by_fingers_lags_the_command(rng: np.random.Generator) -> None:
     episode = make_episode(rng, open_at=140, finger_lag=2)
-    assert GripperTiming(on="fingers").location(episode) == (142, 142)
-    assert GripperTiming().location(episode) == (140, 140)
+    assert GripperTiming(on="fingers").look(episode).steps == (142, 142)
+    assert GripperTiming().look(episode).steps == (140, 140)
 
 
 def test_gripper_timing_abstains_where_it_cannot_know(rng: np.random.Generator) -> None:
@@ -243,15 +243,15 @@ def test_gripper_timing_abstains_where_it_cannot_know(rng: np.random.Generator) 
 def test_gripper_timing_says_when_and_where(rng: np.random.Generator) -> None:
     early = make_episode(rng, open_at=140)
     scorer = GripperTiming()
-    assert scorer.explain(early) == (
+    assert scorer.look(early).explanation == (
         "the gripper opened at 7.0 s, in LIFT, after 58% of 240 steps"
     )
     scorer.fit([make_episode(rng, open_at=None), make_episode(rng)])
-    assert scorer.explain(early) == (
+    assert scorer.look(early).explanation == (
         "the gripper opened at 7.0 s, in LIFT; clean demonstrations open at 11.9 s or later"
     )
-    assert scorer.explain(make_episode(rng, open_at=None)) is None
-    assert scorer.explain(make_episode(rng)) == (
+    assert scorer.look(make_episode(rng, open_at=None)).explanation is None
+    assert scorer.look(make_episode(rng)).explanation == (
         "the gripper opened at 11.9 s, in RELEASE, after 99% of 240 steps"
     )
 
