@@ -1,4 +1,4 @@
-"""The resampling rule of design.md section 5, written down once more: slowly, and step by step.
+"""The resampling rule of docs/topic-map.md, written down once more: slowly, and step by step.
 
 It shares nothing with the builder, so that the two may be compared.
 """
