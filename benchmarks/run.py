@@ -21,6 +21,7 @@ BENCHMARKS = (
     "kill_cost",
     "many_episodes",
     "scorer_cost",
+    "examine",
     "training_speed",
 )
 
