@@ -30,7 +30,7 @@ $(BIN)/uv:
 		{ rm -rf $(VENV); echo "error: $(PYTHON) cannot make $(VENV): apt install python3-venv" >&2; exit 2; }
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
 
-$(READY): setup.py pyproject.toml package.xml $(wildcard libexec/* launch/* config/*) | $(BIN)/uv
+$(READY): setup.py package.xml curation_ros/nodes/programs.py $(wildcard launch/* config/*) | $(BIN)/uv
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[$(EXTRAS)]' $(if $(TORCH),'$(TORCH)')
 	@# An editable installation leaves out what ros2 run and ros2 launch look up; colcon does this too.
 	@$(BIN)/python -W ignore setup.py --quiet install_data --install-dir $(abspath $(VENV))

@@ -6,6 +6,7 @@ All metadata stands here and none in setup.cfg or [project]: colcon reads setup.
 import re
 from glob import glob
 from pathlib import Path
+from runpy import run_path
 
 from setuptools import find_packages, setup
 
@@ -15,20 +16,44 @@ except ImportError:  # newer than any that colcon can use
     develop = object
 
 PACKAGE = "curation_ros"
-NODES = ("sim_node", "recorder", "curator", "policy_node", "replay")
-EXECUTABLES = {
+# Read, not imported: nothing is installed yet.
+NODES = run_path(f"{PACKAGE}/nodes/programs.py")["NODE_MODULES"]
+PROGRAMS = {
     **{node: f"curation_ros.nodes.executables:{node}" for node in NODES},
     "curation": "curation_ros.cli.main:main",
 }
-# Not imported: nothing is installed yet. package.xml repeats the version, and a test compares.
+# package.xml repeats the version, and a test compares.
 VERSION = re.findall(r'__version__ = "(.+)"', Path(PACKAGE, "version.py").read_text("utf-8"))[0]
-# colcon writes the path of its own Python into programs, which with apt is the system's; so
-# they run on the virtual environment that is active, where pip has put the requirements.
+# colcon writes the path of its own Python into programs. With apt this is the system's Python, but
+# pip has put the requirements into the virtual environment that is active.
 ACTIVE_PYTHON = "/usr/bin/env python3"
+# `ros2 run` looks for lib/<package>/<program>, but pip and colcon install programs into bin.
+LINK = """\
+#!/bin/sh
+# exec keeps one process, so that Ctrl-C reaches the node. Symlinks are not resolved: with
+# colcon build --symlink-install, this file is a symlink out of the installation.
+here=$(CDPATH= cd -- "$(dirname -- "$0")" && pwd)
+exec "$here/../../bin/$(basename -- "$0")" "$@"
+"""
+
+
+def links():
+    """Write a script for each program, to be installed where `ros2 run` looks.
+
+    Returns:
+        Their paths. The folder is not part of the repository.
+    """
+    folder = Path("libexec")
+    folder.mkdir(exist_ok=True)
+    paths = [folder / program for program in PROGRAMS]
+    for path in paths:
+        path.write_text(LINK, "utf-8")
+        path.chmod(0o755)
+    return [str(path) for path in paths]
 
 
 class Develop(develop):
-    """What colcon build --symlink-install runs; it heeds no option of build_scripts."""
+    """What `colcon build --symlink-install` runs. It ignores the options of build_scripts."""
 
     def write_script(self, script_name, contents, *args, **kwargs):
         """Write a program that starts the Python that is active."""
@@ -44,14 +69,12 @@ setup(
     python_requires=">=3.10",
     packages=find_packages(include=["curation_ros*", "sim_node*", "policy_node*"]),
     package_data={"curation_ros": ["py.typed"]},
-    # What `ros2 run` looks up is lib/<package>/<executable>; pip and colcon put console scripts
-    # into bin, so libexec/ holds one-line shell scripts that start those.
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/launch", glob("launch/*.launch.py")),
         (f"share/{PACKAGE}/config", glob("config/*.yaml")),
-        (f"lib/{PACKAGE}", sorted(glob("libexec/*"))),
+        (f"lib/{PACKAGE}", links()),
     ],
     # The floors are the versions of Ubuntu 24.04: the messages of ROS 2 Jazzy from apt are
     # compiled for its NumPy (the README has pip keep it, by 'numpy<2').
@@ -97,7 +120,7 @@ setup(
         ],
     },
     zip_safe=False,
-    entry_points={"console_scripts": [f"{k} = {v}" for k, v in EXECUTABLES.items()]},
+    entry_points={"console_scripts": [f"{k} = {v}" for k, v in PROGRAMS.items()]},
     cmdclass={} if develop is object else {"develop": Develop},
     options={"build_scripts": {"executable": ACTIVE_PYTHON}},
 )

@@ -9,7 +9,6 @@ import importlib.util
 import os
 import re
 import shutil
-import stat
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -19,11 +18,12 @@ import pytest
 
 import curation_ros
 from curation_ros.configuration import share_file
-from curation_ros.nodes.processes import NODE_MODULES, Domain
+from curation_ros.nodes.processes import Domain
+from curation_ros.nodes.programs import NODE_MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("curation_ros", "sim_node", "policy_node")
-EXECUTABLES = {*NODE_MODULES, "curation"}
+PROGRAMS = {*NODE_MODULES, "curation"}
 # Too large for the machine that records, or at odds with what it has already.
 HEAVY = re.compile(r"^(ros-|rclpy|torch|mujoco|robosuite|libero|numba)", re.IGNORECASE)
 
@@ -51,7 +51,7 @@ def _copy(tree: Path) -> Path:
     tree.mkdir()
     for name in ("setup.py", "pyproject.toml", "package.xml", "LICENSE"):
         shutil.copy(ROOT / name, tree)
-    for name in (*PACKAGES, "config", "launch", "libexec", "resource"):
+    for name in (*PACKAGES, "config", "launch", "resource"):
         shutil.copytree(
             ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info")
         )
@@ -100,8 +100,8 @@ def test_pip_lays_out_what_ros2_run_and_launch_look_up(installed):
     }
     assert {p.relative_to(share).as_posix() for p in share.rglob("*") if p.is_file()} == expected
     lib = installed / "lib/curation_ros"
-    assert {p.name for p in lib.iterdir()} == EXECUTABLES
-    for name in EXECUTABLES:
+    assert {p.name for p in lib.iterdir()} == PROGRAMS
+    for name in PROGRAMS:
         assert os.access(lib / name, os.X_OK), name
         assert os.access(installed / "bin" / name, os.X_OK), name
 
@@ -155,7 +155,8 @@ def test_symlink_install_runs_on_the_active_python(tmp_path):
     subprocess.run(
         [python, *command], cwd=tree, check=True, env={**os.environ, "PYTHONPATH": str(site)}
     )
-    for name in EXECUTABLES:
+    assert {p.name for p in (prefix / "bin").iterdir()} == PROGRAMS
+    for name in PROGRAMS:
         program = prefix / "bin" / name
         assert program.read_text().startswith("#!/usr/bin/env python3\n"), name
         assert os.access(program, os.X_OK)
@@ -235,18 +236,11 @@ def test_base_requirements_are_light():
     assert all(re.search(r"extra == ['\"]ros['\"]", r) for r in ros)
 
 
-def test_programs_in_libexec_are_one_script():
-    scripts = {path.name: path for path in (ROOT / "libexec").iterdir()}
-    assert set(scripts) == EXECUTABLES
-    assert len({path.read_bytes() for path in scripts.values()}) == 1
-    for path in scripts.values():
-        assert stat.S_IMODE(path.stat().st_mode) & 0o755 == 0o755, path
-
-
-def test_entry_points_are_the_nodes_and_can_be_imported():
-    ours = importlib.metadata.entry_points(group="console_scripts")
-    points = {p.name: p for p in ours if p.value.startswith("curation_ros.")}
-    assert set(points) == EXECUTABLES
+def test_entry_points_are_the_nodes_and_can_be_imported(installed):
+    (site,) = installed.glob("lib/python3.*/site-packages")
+    (ours,) = importlib.metadata.distributions(name="curation_ros", path=[str(site)])
+    points = {p.name: p for p in ours.entry_points if p.group == "console_scripts"}
+    assert set(points) == PROGRAMS
     assert all(callable(point.load()) for point in points.values())
 
 

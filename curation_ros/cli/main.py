@@ -9,10 +9,11 @@ import sys
 from collections.abc import Sequence
 
 from curation_ros.core.errors import ConfigError, CurationError
+from curation_ros.extras import how_to_install
 from curation_ros.version import __version__
 
-#: Subcommand -> (module, one line of help). The only list; modules are imported when used, so
-#: that `curation score` needs no torch and `curation train` no ROS.
+#: Subcommand -> (module, one line of help), the only list. A module is imported when its command
+#: is used, so `curation score` needs no torch and `curation train` needs no ROS.
 COMMANDS = {
     "score": ("curation_ros.cli.score", "score bags and decide on them, without ROS"),
     "audit": ("curation_ros.cli.audit", "how well scores tell good from bad, or only length"),
@@ -30,7 +31,7 @@ COMMANDS = {
     "report": ("curation_ros.cli.report", "draw a study's results: HTML, Markdown"),
     "demo": ("curation_ros.cli.demo", "the whole path, from recording to the trained policy"),
 }
-DONE, FINDINGS, USAGE, NOTHING, FAULT = 0, 1, 2, 3, 70
+DONE, FINDINGS, USAGE, NOTHING, INTERNAL = 0, 1, 2, 3, 70
 _INTERRUPTED = 130
 
 
@@ -38,14 +39,14 @@ def parser(command: str = "") -> argparse.ArgumentParser:
     """The command line.
 
     Args:
-        command: the subcommand whose arguments are wanted; empty: all of them. Importing all
-            modules takes a second.
+        command: the subcommand whose arguments are added; empty: the arguments of all. Importing
+            all modules takes a second.
     """
     top = argparse.ArgumentParser(
         prog="curation",
         description="Curate robot demonstrations: score, decide, select, train, evaluate.",
         epilog="Exit codes: 0 done, 1 findings (with --check), 2 usage, 3 nothing could be done, "
-        "70 a fault of ours, 130 interrupted.",
+        "70 internal error, 130 interrupted.",
     )
     top.add_argument("--version", action="version", version=f"curation_ros {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -58,7 +59,7 @@ def parser(command: str = "") -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one subcommand; a user never sees a traceback for bad input."""
+    """Run one subcommand and return its exit code. Bad input never ends in a traceback."""
     words = list(sys.argv[1:] if argv is None else argv)
     chosen = next((word for word in words if not word.startswith("-")), "-")
     try:
@@ -70,19 +71,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(err, NOTHING)
     except KeyboardInterrupt:
         return _complain("interrupted", _INTERRUPTED)
-    except BrokenPipeError:  # the reader of our output has gone, as `head` does
+    except BrokenPipeError:  # the reader of the output is gone, as with `head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except ModuleNotFoundError as err:
-        return _complain(f"{chosen} needs {err.name}: install its extra", USAGE)
-    except ImportError as err:  # it is there, and does not load
+        missing = str(err.name)
+        return _complain(f"{chosen} needs {missing}: {how_to_install(missing)}", USAGE)
+    except ImportError as err:  # the module is installed but does not load
         return _complain(f"{chosen}: {str(err).partition(chr(10))[0]}", USAGE)
     except Exception as err:
         if os.environ.get("CURATION_TRACEBACK"):
             raise
         return _complain(
-            f"a fault of ours: {type(err).__name__}: {err} (CURATION_TRACEBACK=1 shows where)",
-            FAULT,
+            f"internal error: {type(err).__name__}: {err} (CURATION_TRACEBACK=1 shows where)",
+            INTERNAL,
         )
     return code
 

@@ -18,15 +18,8 @@ from types import MappingProxyType, TracebackType
 from typing import IO, Any
 
 from curation_ros.core.errors import CurationError
+from curation_ros.nodes.programs import NODE_MODULES
 
-#: Node -> module whose `main` runs it.
-NODE_MODULES = {
-    "sim_node": "sim_node.node",
-    "recorder": "curation_ros.nodes.recorder",
-    "curator": "curation_ros.nodes.curator",
-    "policy_node": "policy_node.node",
-    "replay": "curation_ros.nodes.replay",
-}
 # Domains above 101 need ports of the ephemeral range of Linux.
 _DOMAINS = range(1, 102)
 _PATIENCE_S = 10.0

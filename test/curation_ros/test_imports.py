@@ -52,8 +52,11 @@ def _run(code: str, blocked: str, *arguments: object) -> subprocess.CompletedPro
 def test_core_imports_without_ros_simulator_torch_and_bags() -> None:
     done = _run(_IMPORT_ALL, f"{ROBOTICS},mcap,rosbags,rich,safetensors,curation_ros.bags")
     assert done.returncode == 0, done.stderr
-    modules = {f"curation_ros.core.{p.stem}" for p in (ROOT / "curation_ros/core").rglob("*.py")}
-    assert modules - {"curation_ros.core.__init__"} <= set(done.stdout.split())
+    paths = [
+        p.relative_to(ROOT).with_suffix("") for p in (ROOT / "curation_ros/core").rglob("*.py")
+    ]
+    modules = {".".join(p.parts).removesuffix(".__init__") for p in paths}
+    assert set(done.stdout.split()) == modules - {"curation_ros.core"}
 
 
 def test_commands_need_nothing_that_they_do_not_use(dataset: Dataset, tmp_path: Path) -> None:
@@ -81,6 +84,7 @@ def test_commands_need_nothing_that_they_do_not_use(dataset: Dataset, tmp_path: 
     row = json.loads(score[1])
     assert (row["name"], row["length"], row["findings"]) == ("pick-1", 240, [])
     assert row["scores"]["gripper_timing"] == 237 / 240
-    for (code, out, err), said in ((train, "train needs torch"), (recorder, "record needs rclpy")):
+    for (code, out, err), name, extra in ((train, "torch", "policy"), (recorder, "rclpy", "ros")):
         assert (code, out, len(err.splitlines())) == (2, "", 1)
-        assert err.startswith(f"error: {said}")
+        assert f" needs {name}: " in err
+        assert f"pip install '.[{extra}]'" in err

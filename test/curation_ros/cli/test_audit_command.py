@@ -144,7 +144,7 @@ def test_wrong_usage_is_one_line_and_a_code(
     told = curation("audit", told_data, *arguments, "--json")
     assert (told.code, told.out) == (code, "")
     assert said in told.err
-    assert "fault of ours" not in told.err
+    assert "internal error" not in told.err
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def test_wrong_export_is_one_line_and_a_code(
     told = curation("export", data, *arguments, "--json")
     assert (told.code, told.out) == (code, "")
     assert said in told.err
-    assert "fault of ours" not in told.err
+    assert "internal error" not in told.err
     assert Path("taken").read_text() == "precious"
     assert not Path("new").exists()
 

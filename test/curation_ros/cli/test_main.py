@@ -14,7 +14,7 @@ from curation_ros.cli import main as module
 from curation_ros.cli.main import COMMANDS, main
 from curation_ros.core.errors import BagError, ConfigError
 
-DONE, USAGE, NOTHING, FAULT, INTERRUPTED = 0, 2, 3, 70, 130
+DONE, USAGE, NOTHING, INTERNAL, INTERRUPTED = 0, 2, 3, 70, 130
 Run = Callable[..., Any]
 
 
@@ -70,10 +70,14 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], int]:
     [
         (ConfigError("key 'x'"), USAGE, "error: key 'x'"),
         (BagError("bag y"), NOTHING, "error: bag y"),
-        (ModuleNotFoundError("no torch", name="torch"), USAGE, "error: fail needs torch"),
+        (
+            ModuleNotFoundError("no torch", name="torch"),
+            USAGE,
+            "error: fail needs torch: pip install '.[policy]'",
+        ),
         (ImportError("NumPy 2 is needed\nby x", name="x"), USAGE, "error: fail: NumPy 2 is"),
         (KeyboardInterrupt(), INTERRUPTED, "error: interrupted"),
-        (RuntimeError("why?"), FAULT, "error: a fault of ours: RuntimeError: why?"),
+        (RuntimeError("why?"), INTERNAL, "error: internal error: RuntimeError: why?"),
     ],
 )
 def test_error_is_one_line_and_a_code(
@@ -90,7 +94,7 @@ def test_error_is_one_line_and_a_code(
     assert len(err.splitlines()) == 1
 
 
-def test_fault_of_ours_can_be_traced(
+def test_internal_error_can_be_traced(
     failing: Callable[[BaseException], int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CURATION_TRACEBACK", "1")

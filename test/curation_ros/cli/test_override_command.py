@@ -86,7 +86,7 @@ def test_override_that_cannot_be_written_is_told(curation: Run, folder: Path) ->
     (folder / "data" / "decisions").write_text("in the way")
     told = curation("override", folder / "data", "pick-0", "keep", "--json")
     assert (told.code, told.out) == (NOTHING, "")
-    assert "fault of ours" not in told.err
+    assert "internal error" not in told.err
 
 
 def test_folder_that_is_no_dataset_is_told(curation: Run, folder: Path) -> None:

@@ -206,7 +206,7 @@ def test_file_that_is_no_bag_is_told_by_path(curation: Run, folder: Path, kind: 
     shown = curation("score", path, "--config", folder / "curation.yaml")
     assert shown.code == NOTHING
     assert "warning: " in shown.err
-    assert "fault of ours" not in shown.err
+    assert "internal error" not in shown.err
     assert "Traceback" not in shown.err
 
 
@@ -286,7 +286,7 @@ def test_wrong_usage_is_one_line_and_a_code(
     *_, last = told.err.splitlines()
     assert "error: " in last
     assert said in last
-    assert "fault of ours" not in told.err
+    assert "internal error" not in told.err
 
 
 def test_reference_that_cannot_be_trusted_is_named(curation: Run, folder: Path) -> None:
@@ -405,7 +405,7 @@ def test_decisions_that_cannot_be_written_are_told(curation: Run, folder: Path) 
     told = curation("score", folder / "data", *_options(folder), "--write", "--json")
     assert told.code == NOTHING
     assert str(folder / "data" / "decisions") in told.err
-    assert "fault of ours" not in told.err
+    assert "internal error" not in told.err
 
 
 # --- the real executable ------------------------------------------------------------------------

@@ -146,7 +146,7 @@ def test_wrong_selection_is_one_line_and_a_code(
     told = curation("select", data, *arguments, "--json")
     assert (told.code, told.out) == (code, "")
     assert said in told.err
-    assert "fault of ours" not in told.err
+    assert "internal error" not in told.err
 
 
 def test_folder_that_is_no_dataset_is_told(curation: Run, folder: Path) -> None:

@@ -84,4 +84,4 @@ def test_nothing_to_check_is_one_line_and_a_code(
     told = curation("self-check", *arguments, "--json")
     assert (told.code, told.out) == (code, "")
     assert said in told.err
-    assert "fault of ours" not in told.err
+    assert "internal error" not in told.err

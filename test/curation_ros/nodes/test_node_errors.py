@@ -7,15 +7,18 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import yaml
 from episodes import topic_map
 from graph import Graph
 
-from curation_ros.nodes.processes import NODE_MODULES, node_arguments
+from curation_ros.nodes.processes import node_arguments
+from curation_ros.nodes.programs import NODE_MODULES
 
 pytestmark = pytest.mark.ros
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def map_with(**changes):
@@ -197,7 +200,7 @@ def test_misspelt_parameter_is_named(graph):
 STOPS_ITSELF = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nsignal.pause()\n"
 IMPORTED = """
 import sys
-from curation_ros import executables
+from curation_ros.nodes import executables
 executables.NODE_MODULES = {"recorder": "module"}
 sys.exit(executables.recorder())
 """
@@ -212,7 +215,7 @@ def _starting(code, module, folder):
     (folder / "module.py").write_text(module)
     return subprocess.run(
         [sys.executable, "-c", code],
-        env={**os.environ, "PYTHONPATH": str(folder)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])},
         capture_output=True,
         text=True,
         timeout=60,

@@ -17,7 +17,8 @@ import yaml
 
 from curation_ros.core.errors import CurationError
 from curation_ros.nodes import processes
-from curation_ros.nodes.processes import NODE_MODULES, Domain, Nodes
+from curation_ros.nodes.processes import Domain, Nodes
+from curation_ros.nodes.programs import NODE_MODULES
 
 PATIENCE_S = 20.0
 #: Stands in for a node: notes how it was started, and ends as its parameters say.
@@ -202,7 +203,8 @@ def test_node_that_does_not_end_in_time_is_named(told: Path, domain: Domain) -> 
 _PARENT = """
 import sys, time
 from pathlib import Path
-from curation_ros.nodes.processes import NODE_MODULES, Domain, Nodes
+from curation_ros.nodes.processes import Domain, Nodes
+from curation_ros.nodes.programs import NODE_MODULES
 NODE_MODULES["stand_in"] = "stand_in"
 with Nodes(Domain(), Path(sys.argv[1]) / "logs") as nodes:
     nodes.start("stand_in", {"name": "orphan"})
