@@ -18,6 +18,8 @@ from curation_ros.nodes.processes import NODE_MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "bags" / "README.md"]
+#: Most words of a sentence of prose, on average over a page.
+MEAN_WORDS = 20
 
 _LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -145,11 +147,37 @@ def _parameters(node: str) -> dict[str, str]:
     return {p.name: "[]" if p.default == () else json.dumps(p.default) for p in table}
 
 
+def words_of_sentences(text: str) -> list[int]:
+    """Words of each sentence of a page's prose: no headings, tables or code."""
+    text = re.sub(r"<!--.*?-->", "", _FENCE.sub("\n", text), flags=re.DOTALL)
+    blocks: list[list[str]] = [[]]
+    for line in map(str.strip, text.splitlines()):
+        if not line or line.startswith(("|", "#", "![")):
+            blocks.append([])
+        elif re.match(r"(- |\d+\. )", line):
+            blocks.append([line.partition(" ")[2]])
+        else:
+            blocks[-1].append(line)
+    sentences = []
+    for block in blocks:
+        prose = re.sub(r"`[^`]*`", "code", _LINK.sub("link", " ".join(block)))
+        sentences += re.split(r"(?<=[.!?])[*)\"]*\s+(?=[A-Z0-9\"*(])", prose)
+    counts = (len(re.findall(r"\S*\w\S*", sentence)) for sentence in sentences)
+    return [n for n in counts if n > 1]
+
+
+@pages
+def test_sentences_are_short(page: Path) -> None:
+    words = words_of_sentences(page.read_text())
+    assert sum(words) <= MEAN_WORDS * len(words), f"{sum(words)} words in {len(words)} sentences"
+
+
 def test_pages_are_taken_apart() -> None:
     text = (
         "# A heading of five words\n\nOne [link](a.md) and `code of words`. Two\nlines!\n\n"
         "- item one\n\n| a | table |\n\n```sh\ncuration index x \\\n"
         " --rebuild  # or: curation y z\n```\n"
     )
+    assert words_of_sentences(text) == [4, 2, 2]
     assert list(calls_of(text)) == [("index", " x   --rebuild "), ("y", " z")]
     assert code_of(text)[-1] == "code of words"
