@@ -36,15 +36,16 @@ from curation_ros.bags.reader import read_episode
 from curation_ros.core.episode.phases import PHASES
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.study.collect import Collection, collect
-from policy_node.controller import PolicyController
 from policy_node.policy import Policy
-from policy_node.rollouts import field_values, rollout
+from policy_node.rollouts import SimController, rollout
 from policy_node.train import train
 from sim_node.defects import DEFECTS, Defect
-from sim_node.env import BOWL, GRIPPER_CLOSE, GRIPPER_OPEN, LiberoEnv, Observation
-from sim_node.episodes import EpisodeResult, Step, run_episode
-from sim_node.expert import Controller, Expert
+from sim_node.env import BOWL, LiberoEnv
+from sim_node.environment import GRIPPER_CLOSE, GRIPPER_OPEN, Command
+from sim_node.episodes import EpisodeLimits, EpisodeResult, run_episode
+from sim_node.expert import Expert
 from sim_node.starts import Start, generated_start, official_start
+from sim_node.tasks.task import Controller, Step
 
 COMMAND = "python benchmarks/run.py closed_loop"
 PARTS = ("speed", "pairs")
@@ -74,17 +75,6 @@ _JITTER_M = 0.004
 """As few demonstrations need it, see `policy_node.train.train`."""
 
 Floats = NDArray[np.float64]
-
-
-class PolicyDriver:
-    """A policy in the shape that `run_episode` drives, as `rollout` has it; for one episode."""
-
-    def __init__(self, policy: Policy) -> None:
-        self._controller = PolicyController(policy)
-
-    def act(self, observation: Observation, phase_index: int) -> tuple[Floats, float]:
-        """The policy's command."""
-        return self._controller.act(field_values(observation), phase_index)
 
 
 @dataclass(frozen=True)
@@ -142,11 +132,12 @@ def recorded_states(env: LiberoEnv, start: Start, policy: Policy) -> list[Floats
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
     states: list[Floats] = []
 
-    def remember(_: Step) -> None:
+    def remember(_: Step, __: Command) -> None:
         states.append(np.empty(mujoco.mj_stateSize(env.model, kind)))
         mujoco.mj_getState(env.model, env.data, states[-1], kind)
 
-    run_episode(env, start, PolicyDriver(policy), steps_after_success=0, on_step=remember)
+    limits = EpisodeLimits(steps_after_success=0)
+    run_episode(env, start, SimController(policy), limits, on_step=remember)
     return states
 
 
@@ -254,7 +245,7 @@ def pairs(clean: Policy, contaminated: Policy) -> Iterator[Pair]:
             yield Pair(
                 kind,
                 official_start(k),
-                partial(PolicyDriver, policy),
+                partial(SimController, policy),
                 steps_after_success=0,
             )
 
@@ -262,20 +253,25 @@ def pairs(clean: Policy, contaminated: Policy) -> Iterator[Pair]:
 def run_pair(env: LiberoEnv, pair: Pair) -> Run:
     """The episode on the path of this environment."""
     steps: list[Step] = []
+    grippers: list[float] = []
+
+    def remember(step: Step, command: Command) -> None:
+        steps.append(step)
+        grippers.append(command.gripper)
+
     result = run_episode(
         env,
         pair.start,
         pair.controller(),
-        max_steps=MAX_STEPS,
-        steps_after_success=pair.steps_after_success,
-        on_step=steps.append,
+        EpisodeLimits(MAX_STEPS, pair.steps_after_success),
+        on_step=remember,
     )
     seen = [*(step.observation for step in steps), env.observe()]
     has_closed, let_go = False, len(steps)
-    for step in steps:
-        has_closed |= step.gripper == GRIPPER_CLOSE
-        if has_closed and step.gripper == GRIPPER_OPEN:
-            let_go = step.index
+    for index, gripper in enumerate(grippers):
+        has_closed |= gripper == GRIPPER_CLOSE
+        if has_closed and gripper == GRIPPER_OPEN:
+            let_go = index
             break
     return Run(
         result,

@@ -12,7 +12,8 @@ import numpy as np
 
 from sim_node.defects import DEFECTS
 from sim_node.env import LiberoEnv
-from sim_node.episodes import EpisodePlan, EpisodeResult, run_episode
+from sim_node.episodes import EpisodeResult, run_episode
+from sim_node.planning import EpisodePlan
 from sim_node.starts import start_by_name, start_names
 
 

@@ -24,8 +24,10 @@ from policy_node.batch_training import FailedTraining, TrainingJob, train_many
 from policy_node.policy import Policy
 from policy_node.rollouts import GiveUp, SimController
 from sim_node.env import process_env
-from sim_node.episodes import Step, run_episode
+from sim_node.environment import Command
+from sim_node.episodes import EpisodeLimits, run_episode
 from sim_node.starts import start_by_name
+from sim_node.tasks.task import Step
 
 #: How many good and how many bad demonstrations a policy learns from.
 SETS = ((16, 64), (16, 16), (16, 4), (16, 0), (6, 0), (9, 3))
@@ -53,14 +55,18 @@ def watch(policy: Path, start: str) -> dict[str, Any]:
     give_up = GiveUp()
     said: list[tuple[int, str]] = []
 
-    def look(step: Step) -> None:
+    def look(step: Step, _: Command) -> None:
         why = give_up(step)
         if why and not said:
             said.append((step.index, why))
 
     controller = SimController(Policy.load(policy))
     ended = run_episode(
-        process_env(), start_by_name(start), controller, steps_after_success=0, on_step=look
+        process_env(),
+        start_by_name(start),
+        controller,
+        EpisodeLimits(steps_after_success=0),
+        on_step=look,
     )
     step, why = said[0] if said else (ended.n_steps, "")
     return {

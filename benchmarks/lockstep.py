@@ -153,7 +153,7 @@ def _on_graph(folder: Path, name: str, starts: str) -> list[Any]:
 def _in_process(policy: Any, starts: str) -> list[Any]:
     from policy_node.rollouts import SimController
     from sim_node.env import LiberoEnv
-    from sim_node.episodes import run_episode
+    from sim_node.episodes import EpisodeLimits, run_episode
     from sim_node.starts import parse_starts
 
     times = []
@@ -164,9 +164,8 @@ def _in_process(policy: Any, starts: str) -> list[Any]:
                 env,
                 start,
                 SimController(policy),
-                max_steps=MAX_STEPS,
-                steps_after_success=0,
-                on_step=lambda _, clock=clock: clock.append(time.perf_counter()),
+                EpisodeLimits(MAX_STEPS, steps_after_success=0),
+                on_step=lambda *_, clock=clock: clock.append(time.perf_counter()),
             )
             times.append(np.diff(clock)[1:])
     return times

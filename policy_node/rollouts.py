@@ -12,9 +12,11 @@ from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.types import Floats
 from policy_node.controller import PolicyController
 from policy_node.policy import Policy
-from sim_node.env import BOWL, PLATE, LiberoEnv, Observation
-from sim_node.episodes import MAX_STEPS, Step, run_episode
+from sim_node.env import BOWL, PLATE, LiberoEnv
+from sim_node.environment import Environment, Observation
+from sim_node.episodes import MAX_STEPS, EpisodeLimits, run_episode
 from sim_node.starts import Start
+from sim_node.tasks.task import Step
 
 
 @dataclass(frozen=True)
@@ -61,9 +63,9 @@ class SimController:
     def __init__(self, policy: Policy) -> None:
         self._controller = PolicyController(policy)
 
-    def act(self, observation: Observation, phase_index: int) -> tuple[Floats, float]:
+    def act(self, step: Step) -> tuple[Floats, float]:
         """Twist and gripper, as `PolicyController.act` says."""
-        return self._controller.act(field_values(observation), phase_index)
+        return self._controller.act(field_values(step.observation), step.phase_index)
 
 
 class GiveUp:
@@ -116,7 +118,7 @@ class GiveUp:
 
 
 def rollout(
-    env: LiberoEnv,
+    env: Environment,
     start: Start,
     policy: Policy,
     max_steps: int = MAX_STEPS,
@@ -141,8 +143,7 @@ def rollout(
         env,
         start,
         SimController(policy),
-        max_steps=max_steps,
-        steps_after_success=0,
+        EpisodeLimits(max_steps, steps_after_success=0),
         give_up=GiveUp() if gives_up else None,
     )
     ended = "success" if result.is_success else result.given_up or "max_steps"
@@ -152,7 +153,7 @@ def rollout(
 def evaluate(
     policy: Policy,
     starts: Iterable[Start],
-    env: LiberoEnv | None = None,
+    env: Environment | None = None,
     max_steps: int = MAX_STEPS,
     progress: Callable[[Rollout], None] | None = None,
 ) -> list[Rollout]:
@@ -168,7 +169,7 @@ def evaluate(
     Raises:
         ConfigError, PolicyError, SimError: as `rollout` does.
     """
-    simulator = LiberoEnv() if env is None else env
+    simulator: Environment = LiberoEnv() if env is None else env
     try:
         rollouts = []
         for start in starts:

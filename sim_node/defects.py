@@ -13,8 +13,9 @@ import numpy as np
 
 from curation_ros.core.types import Floats
 from sim_node import phases
-from sim_node.env import BOWL, GRIPPER_OPEN, Observation
-from sim_node.expert import Controller
+from sim_node.env import BOWL
+from sim_node.environment import GRIPPER_OPEN
+from sim_node.tasks.task import Controller, Step
 
 
 class DefectiveController(Controller, Protocol):
@@ -46,9 +47,9 @@ class NoDefect:
         del seed  # nothing varies
         self._controller = controller
 
-    def act(self, observation: Observation, phase_index: int) -> tuple[Floats, float]:
+    def act(self, step: Step) -> tuple[Floats, float]:
         """The command of the controller."""
-        return self._controller.act(observation, phase_index)
+        return self._controller.act(step)
 
     def truth(self) -> dict[str, Any]:
         """That nothing was injected."""
@@ -74,12 +75,13 @@ class EarlyRelease:
         self._release_step: int | None = None
         self._n_steps = 0
 
-    def act(self, observation: Observation, phase_index: int) -> tuple[Floats, float]:
+    def act(self, step: Step) -> tuple[Floats, float]:
         """The controller's motion, with the gripper opened from the release on."""
-        action, gripper = self._controller.act(observation, phase_index)
+        action, gripper = self._controller.act(step)
+        observation = step.observation
         if self._bowl_start_m is None:
             self._bowl_start_m = observation.objects[BOWL][0].copy()
-        if self._release_step is None and phase_index >= phases.LIFT:
+        if self._release_step is None and step.phase_index >= phases.LIFT:
             height_m = float(observation.eef_position_m[2])
             if self._lift_start_m is None:
                 self._lift_start_m = height_m

@@ -1,45 +1,116 @@
-"""Runs one episode: observe, get a command, step, until it has ended; the same without a graph."""
+"""Drives episodes of the sim node: sends what is observed, gets commands, and reports each end.
+
+Collections run the same code without a graph, see `curation_ros.study.collect`.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, Protocol
+
+import numpy as np
 
 from curation_ros.core.episode.identity import new_episode_id
 from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.core.errors import SimError
 from curation_ros.core.types import NS_PER_S
 from sim_node.defects import DefectiveController
-from sim_node.env import LiberoEnv, Observation
-from sim_node.episodes import EpisodePlan
+from sim_node.environment import Command, Environment
+from sim_node.episodes import MAX_STEPS, STEPS_AFTER_SUCCESS, EpisodeLimits, Pilot, Run
 from sim_node.output import COMMAND_TOPICS, GRIPPER_JOINT, SimOutput
-from sim_node.phases import PhaseTracker
+from sim_node.planning import EpisodePlan
 from sim_node.starts import Start
+from sim_node.tasks.task import Step
 
-Command = tuple[list[float], float]
-#: Yields to the executor: True asks to be called again at once.
-Script = Generator[bool, None, Command]
+#: Yields to the executor until its result is there; True asks to be resumed at once.
+CommandScript = Generator[bool, None, Command]
 
 #: As LIBERO names it.
 TASK = "libero_spatial/0"
 
 _REPEAT_S = 0.5
 _CHECK_S = 1.0
-# Two nodes find each other in part of a second; on a machine that is busy, in several.
-_HEARING_S = 10.0
+# Discovery between two nodes takes part of a second; on a busy machine, several seconds.
+_CONFIRM_S = 10.0
 
 
 class AbortedError(Exception):
     """The running episode cannot go on; the message says why."""
 
 
+@dataclass(frozen=True)
+class DriveSettings:
+    """How episodes are driven; the attributes are parameters of the sim node.
+
+    Attributes:
+        mode: `expert`: the scripted expert gives the commands; `command`: messages do.
+        sync: `lockstep`: step when the command is there; `free`: step once per control period.
+        max_steps: most commands of an episode.
+        max_steps_defective: the same for episodes with a defect; 0: max_steps.
+        steps_after_success: commands after the one that succeeded.
+        realtime_factor: speed in `free`, 1 is real time.
+        hold_timeout_s: in `free`, a command older than this counts as zero.
+        command_timeout_s: in `lockstep`, longest wait for a command.
+    """
+
+    mode: Literal["expert", "command"] = "expert"
+    sync: Literal["lockstep", "free"] = "lockstep"
+    max_steps: int = MAX_STEPS
+    max_steps_defective: int = 0
+    steps_after_success: int = STEPS_AFTER_SUCCESS
+    realtime_factor: float = 1.0
+    hold_timeout_s: float = 0.5
+    command_timeout_s: float = 5.0
+
+    def limits(self, defect: str) -> EpisodeLimits:
+        """When an episode with this defect ends.
+
+        Raises:
+            ConfigError: if a number is out of range.
+        """
+        steps = self.max_steps if defect == "none" else self.max_steps_defective or self.max_steps
+        return EpisodeLimits(steps, self.steps_after_success)
+
+
+class Peers(Protocol):
+    """The other nodes of the graph, as far as an episode depends on them."""
+
+    def wait_for_recorder(self, episode_id: str) -> Iterator[bool]:
+        """Yield until the recorder, if there is one to wait for, records a started episode."""
+
+    def unconfirmed(self, episode_id: str) -> str:
+        """The recorder and the topics of a started episode that it still lacks, or empty."""
+
+    def several_commanders(self) -> str:
+        """Names of the nodes that send commands if there are several, or empty."""
+
+
+class NoPeers:
+    """Where there is no graph, there is nothing to wait for."""
+
+    def wait_for_recorder(self, episode_id: str) -> Iterator[bool]:
+        """Nothing."""
+        del episode_id
+        yield from ()
+
+    def unconfirmed(self, episode_id: str) -> str:
+        """Empty."""
+        del episode_id
+        return ""
+
+    def several_commanders(self) -> str:
+        """Empty."""
+        return ""
+
+
 class Commands:
-    """The newest message of each command topic, and the stamps that were seen."""
+    """The newest message of each command topic, and the distinct stamps of all of them."""
 
     def __init__(self) -> None:
-        """Nothing has been commanded yet."""
+        """Start without any command."""
         self.clear()
 
     def clear(self) -> None:
@@ -49,13 +120,13 @@ class Commands:
         self._stamps: dict[str, set[int]] = {topic: set() for topic in COMMAND_TOPICS}
 
     def take(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Note a message."""
+        """Keep a message."""
         self._newest[topic] = (stamp_ns, message)
         self._arrived_s = time.monotonic()
         self._stamps[topic].add(stamp_ns)
 
     def accept(self, stamp_ns: int) -> None:
-        """Note a command that did not come as messages."""
+        """Count a command that did not arrive as messages."""
         for stamps in self._stamps.values():
             stamps.add(stamp_ns)
 
@@ -64,12 +135,12 @@ class Commands:
         return [t for t in COMMAND_TOPICS if self._newest.get(t, (0,))[0] != stamp_ns]
 
     def is_fresh(self, timeout_s: float) -> bool:
-        """Whether both topics have spoken, and the last word is not older than this."""
-        whole = len(self._newest) == len(COMMAND_TOPICS)
-        return whole and time.monotonic() - self._arrived_s <= timeout_s
+        """Whether both topics have a message, and the last one is not older than this."""
+        is_whole = len(self._newest) == len(COMMAND_TOPICS)
+        return is_whole and time.monotonic() - self._arrived_s <= timeout_s
 
     def counts(self, start_ns: int, end_ns: int) -> dict[str, int]:
-        """Number of stamps in a window, by topic."""
+        """Number of distinct stamps in a window, by topic."""
         return {
             topic: sum(start_ns <= stamp <= end_ns for stamp in stamps)
             for topic, stamps in self._stamps.items()
@@ -77,59 +148,58 @@ class Commands:
 
     @property
     def newest(self) -> Command:
-        """Action and gripper command.
+        """The newest command.
 
         Raises:
-            AbortedError: if a message does not have what it should.
+            AbortedError: if a message lacks a value.
         """
         linear = self._newest[COMMAND_TOPICS[0]][1].twist.linear
         joints = self._newest[COMMAND_TOPICS[1]][1]
         if GRIPPER_JOINT not in joints.name or len(joints.position) != len(joints.name):
             raise AbortedError(f"{COMMAND_TOPICS[1]} has no position of joint {GRIPPER_JOINT!r}")
         gripper = joints.position[list(joints.name).index(GRIPPER_JOINT)]
-        return [linear.x, linear.y, linear.z], gripper
+        return Command(np.array([linear.x, linear.y, linear.z]), gripper)
 
 
 @dataclass
-class Run:
-    """An episode, while it runs and afterwards.
+class DrivenEpisode:
+    """An episode of the sim node, while it runs and afterwards.
 
     Attributes:
-        id, name, plan: what it is.
+        id: uuid of the episode.
+        name: short name.
+        plan: what was planned.
         start_ns: stamp of the first observation.
-        controller: the expert with its defect; None where commands come as messages.
-        executed: commands executed.
-        success_step: index of the one after which the goal held for the first time.
-        stage: name of the phase reached.
-        reason: why it was aborted, empty if it was not.
+        run: the loop.
+        controller: the expert with its defect; None where commands arrive as messages.
+        reset_s: seconds that the reset took.
+        reason: why the episode was aborted; empty if it was not.
     """
 
     id: str
     name: str
     plan: EpisodePlan
     start_ns: int
+    run: Run
     controller: DefectiveController | None
-    executed: int = 0
-    success_step: int | None = None
-    stage: str = ""
+    reset_s: float
     reason: str = "the sim node was stopped"
-    began_s: float = field(default_factory=time.monotonic)
 
     @property
     def outcome(self) -> str:
-        """As `episode/outcome` has it."""
-        return "failed" if self.success_step is None or self.reason else "succeeded"
+        """`succeeded` or `failed`, as topic `episode/outcome` has it."""
+        return "failed" if self.run.success_step is None or self.reason else "succeeded"
 
     def truth(self) -> dict[str, Any]:
-        """A line of truth.jsonl: outcome and what was injected, for evaluation only."""
+        """The line of truth.jsonl: outcome and what was injected, for evaluation only."""
         injected = self.controller.truth() if self.controller is not None else {}
         return {
             "episode": self.id,
             "name": self.name,
             "outcome": self.outcome,
-            "steps": self.executed,
-            "success_step": self.success_step,
-            "stage": self.stage,
+            "steps": self.run.n_steps,
+            "success_step": self.run.success_step,
+            "stage": self.run.stage,
             "aborted": self.reason,
             "task": TASK,
             "start": self.plan.start,
@@ -140,7 +210,15 @@ class Run:
 
 
 class Driver:
-    """Steps the simulator and says on the graph what is seen and done.
+    """Plays episodes: the commands come from the expert or from messages.
+
+    Args:
+        env: the simulator.
+        out: where observations, commands and events go.
+        commands: filled by the node's subscriptions.
+        settings: how to drive.
+        peers: the other nodes.
+        stamp_ns: before the first stamp; default: the time of the wall clock.
 
     Attributes:
         reset_wanted: set by the node's service; the running episode is then given up.
@@ -148,175 +226,173 @@ class Driver:
 
     def __init__(
         self,
-        env: LiberoEnv,
+        env: Environment,
         out: SimOutput,
         commands: Commands,
-        settings: Mapping[str, Any],
-        announced: Callable[[str], Iterator[bool]] = lambda _id: iter(()),
-        deaf: Callable[[str], str] = lambda _id: "",
+        settings: DriveSettings,
+        peers: Peers | None = None,
         stamp_ns: int | None = None,
     ) -> None:
-        """Make a driver.
-
-        Args:
-            env: the simulator.
-            out: the node's publishers, or what takes their place.
-            commands: filled by the node's subscriptions.
-            settings: the node's parameters.
-            announced: yields until who is waited for has taken notice of a started episode.
-            deaf: name of who is waited for and lacks a topic of a started episode, or empty.
-            stamp_ns: before the first stamp; default: the wall's time.
-        """
         self._env = env
         self._out = out
         self._commands = commands
-        self._p = settings
-        self._announced = announced
-        self._deaf = deaf
+        self._settings = settings
+        self._peers = peers if peers is not None else NoPeers()
         self._checked_s = 0.0
+        self._began_s = 0.0
         self.reset_wanted = False
-        # Stamps begin at the wall's time and never go back, not at a reset either.
+        # Stamps begin at the wall clock's time and never go back, not even at a reset.
         self._stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
 
-    def run(
+    def drive(
         self, plan: EpisodePlan, start: Start, name: str, episode_id: str = ""
-    ) -> Generator[bool, None, Run]:
-        """One episode; if the generator is closed early, the episode is aborted and said so.
+    ) -> Generator[bool, None, DrivenEpisode]:
+        """Play one episode; closing the generator early aborts it and reports that.
 
         Args:
-            plan: what it is.
-            start: the one that the plan names.
+            plan: what to do.
+            start: the start that the plan names.
             name: short name of the episode.
-            episode_id: minted before; empty: minted now.
+            episode_id: its uuid; empty: a new one.
+
+        Raises:
+            ConfigError: if the limits of the settings are out of range.
+            SimError: if the simulation diverges before the episode has started.
         """
-        period_ns = self._env.control_period_ns
-        observation = self._env.reset(start.state)
-        tracker = PhaseTracker.from_observation(observation)
-        controller = plan.controller() if self._p["mode"] == "expert" else None
-        limit = self._p["max_steps"]
-        if plan.defect != "none":
-            limit = self._p["max_steps_defective"] or limit
+        began_s = time.monotonic()
+        run = Run(self._env, start, self._settings.limits(plan.defect))
+        reset_s = time.monotonic() - began_s
+        controller = plan.controller() if self._settings.mode == "expert" else None
         self.reset_wanted = False
         self._commands.clear()
-        self._stamp_ns += period_ns
-        run = Run(episode_id or new_episode_id(), name, plan, self._stamp_ns, controller)
+        self._stamp_ns += self._env.control_period_ns
+        episode = DrivenEpisode(
+            episode_id or new_episode_id(), name, plan, self._stamp_ns, run, controller, reset_s
+        )
+        pilot: Pilot = partial(self._answer_by_messages, episode)
+        if controller is not None:
+            pilot = partial(self._answer_by_expert, episode, controller)
         try:
-            self._out.event(EpisodeEvent(run.id, name, "started", run.start_ns))
-            yield from self._announced(run.id)
-            run.began_s = time.monotonic()
-            while run.executed < limit:
-                self._stamp_ns = run.start_ns + run.executed * period_ns
-                phase = tracker.update(observation)
-                run.stage = tracker.name
-                self._out.observation(self._stamp_ns, observation, tracker, run.id)
-                command = yield from self._command(run, observation, tracker, phase)
-                observation = self._env.step(*command)
-                if run.success_step is None and self._env.is_success():
-                    run.success_step = run.executed
-                run.executed += 1
-                after = self._p["steps_after_success"]
-                if run.success_step is not None and run.executed > run.success_step + after:
-                    break
-                if run.controller is not None or self._p["sync"] == "free":
-                    yield True  # who waits for commands yields there
-            run.reason = ""
+            self._out.event(EpisodeEvent(episode.id, name, "started", episode.start_ns))
+            yield from self._peers.wait_for_recorder(episode.id)
+            self._began_s = time.monotonic()
+            yield from run.play(pilot)
+            episode.reason = ""
         except (AbortedError, SimError) as err:
-            run.reason = str(err)
+            episode.reason = str(err)
         finally:
-            self._out.event(self._end(run))
-        return run
+            self._out.event(self._end(episode))
+        return episode
 
-    def _command(
-        self, run: Run, observation: Observation, tracker: PhaseTracker, phase: int
-    ) -> Script:
-        """The command of this step, once it is there."""
-        if self.reset_wanted:
-            raise AbortedError("reset was asked for")
+    def _answer_by_expert(
+        self, episode: DrivenEpisode, controller: DefectiveController, step: Step
+    ) -> CommandScript:
+        """The expert's command, once the first one has reached the recorder."""
+        if step.index > 0:
+            yield True  # nothing else here lets the executor work
+        observe = self._observe(episode, step)
+        command = Command(*controller.act(step))
 
-        def observe() -> None:
-            self._out.observation(self._stamp_ns, observation, tracker, run.id)
+        def act() -> None:
+            self._out.command(self._stamp_ns, *command)
 
-        if run.controller is not None:
-            xyz, gripper = run.controller.act(observation, phase)
+        self._commands.accept(self._stamp_ns)
+        act()
+        yield from self._until_confirmed(episode, lambda: [], observe, act)
+        if step.index == 0:  # the pace does not make up for the time that this took
+            self._began_s = time.monotonic()
+        yield from self._paced(step)
+        return command
 
-            def act() -> None:
-                self._out.command(self._stamp_ns, xyz, gripper)
-
-            self._commands.accept(self._stamp_ns)
-            act()
-            yield from self._until_heard(run, lambda: [], observe, act)
-            if run.executed == 0:  # who is free does not make up for the time that took
-                run.began_s = time.monotonic()
-            yield from self._paced(run)
-            return list(xyz), gripper
-        if self._p["sync"] == "free":
-            yield from self._paced(run)
-            if self._commands.is_fresh(self._p["hold_timeout_s"]):
+    def _answer_by_messages(self, episode: DrivenEpisode, step: Step) -> CommandScript:
+        """The command that arrives as messages."""
+        settings = self._settings
+        if settings.sync == "free":
+            if step.index > 0:
+                yield True
+            self._observe(episode, step)
+            yield from self._paced(step)
+            if self._commands.is_fresh(settings.hold_timeout_s):
                 return self._commands.newest
-            return [0.0, 0.0, 0.0], 0.0
-        yield from self._until_heard(run, lambda: self._commands.missing(self._stamp_ns), observe)
+            return Command(np.zeros(3), 0.0)
+        observe = self._observe(episode, step)
+        yield from self._until_confirmed(
+            episode, lambda: self._commands.missing(self._stamp_ns), observe
+        )
         now_s = time.monotonic()
-        if run.executed == 0 or now_s - self._checked_s > _CHECK_S:
+        if step.index == 0 or now_s - self._checked_s > _CHECK_S:
             self._checked_s = now_s
-            if strangers := self._out.several_commanders():
-                raise AbortedError(f"commands come from {strangers}: stop all but one")
+            if commanders := self._peers.several_commanders():
+                raise AbortedError(f"commands come from {commanders}: stop all but one")
         return self._commands.newest
 
-    def _until_heard(
-        self, run: Run, missing: Callable[[], list[str]], *again: Callable[[], None]
+    def _observe(self, episode: DrivenEpisode, step: Step) -> Callable[[], None]:
+        """Send the observation of a step; what is returned sends it again."""
+        self._stamp_ns = episode.start_ns + step.index * self._env.control_period_ns
+
+        def send() -> None:
+            self._out.observation(self._stamp_ns, step, episode.id)
+
+        send()
+        if self.reset_wanted:
+            raise AbortedError("reset was asked for")
+        return send
+
+    def _until_confirmed(
+        self, episode: DrivenEpisode, missing: Callable[[], list[str]], *again: Callable[[], None]
     ) -> Iterator[bool]:
-        """Wait until the command is here, and the first one where it is waited for.
+        """Wait for the command; in the first step also until the recorder has all of the step.
+
+        That we have discovered the recorder's subscriptions does not mean that the recorder has
+        discovered our publishers, or the commander's: the first step is repeated until the
+        recorder has it. All later steps follow on the same reliable connections.
 
         Args:
-            run: the episode.
-            missing: topics without an answer to this step's observation.
-            again: what is said anew every half second.
+            episode: the episode.
+            missing: gives the topics without an answer to this step's observation.
+            again: called every half second.
         """
+        timeout_s = self._settings.command_timeout_s
         asked_s = repeated_s = time.monotonic()
-        while (absent := missing()) or self._unheard(run):
-            now_s, timeout_s = time.monotonic(), self._p["command_timeout_s"]
+        while (absent := missing()) or self._unconfirmed(episode):
+            now_s = time.monotonic()
             if self.reset_wanted:
                 raise AbortedError("reset was asked for")
             if absent and now_s - asked_s > timeout_s:
                 raise AbortedError(f"no answer on {' and '.join(absent)} within {timeout_s:g} s")
-            if now_s - asked_s > timeout_s + _HEARING_S:
-                raise AbortedError(f"the first step does not reach {self._unheard(run)}")
+            if now_s - asked_s > timeout_s + _CONFIRM_S:
+                lacking = self._unconfirmed(episode)
+                raise AbortedError(f"the first step does not reach {lacking}")
             if now_s - repeated_s > _REPEAT_S:
                 repeated_s = now_s
-                for say in again:
-                    say()
+                for send in again:
+                    send()
             yield False
 
-    def _unheard(self, run: Run) -> str:
-        """Who has not got all of the first step yet.
+    def _unconfirmed(self, episode: DrivenEpisode) -> str:
+        return "" if episode.run.n_steps else self._peers.unconfirmed(episode.id)
 
-        That we see a recorder's subscriptions, or hear a commander, does not say that the recorder
-        has found our publishers, or the commander's. What follows the first step follows it
-        everywhere, for the transport is reliable; until then the step is said again.
-        """
-        return "" if run.executed else self._deaf(run.id)
-
-    def _paced(self, run: Run) -> Iterator[bool]:
-        """Wait, when free, until the wall has come as far as the episode."""
-        if self._p["sync"] == "free":
-            step_s = self._env.control_period_ns / NS_PER_S / self._p["realtime_factor"]
-            while (left_s := run.began_s + (run.executed + 1) * step_s - time.monotonic()) > 0:
+    def _paced(self, step: Step) -> Iterator[bool]:
+        """In `free`, wait until the wall clock has come as far as the episode."""
+        if self._settings.sync == "free":
+            step_s = self._env.control_period_ns / NS_PER_S / self._settings.realtime_factor
+            while (left_s := self._began_s + (step.index + 1) * step_s - time.monotonic()) > 0:
                 yield left_s < 0.001
 
-    def _end(self, run: Run) -> EpisodeEvent:
-        """How an episode ended; only what was executed belongs to it."""
-        end_ns = run.start_ns + max(0, run.executed - 1) * self._env.control_period_ns
+    def _end(self, episode: DrivenEpisode) -> EpisodeEvent:
+        """The event that ends an episode; only what was executed belongs to it."""
+        run = episode.run
+        end_ns = episode.start_ns + max(0, run.n_steps - 1) * self._env.control_period_ns
         # The first observation is in the window even if no command for it was executed.
-        observed = run.executed or int(bool(run.stage))
-        counts = dict.fromkeys(self._out.observation_topics, observed)
-        counts |= self._commands.counts(run.start_ns, end_ns)
-        kind, reason = ("aborted", f"aborted: {run.reason}") if run.reason else ("ended", "")
+        n_observed = run.n_steps or int(bool(run.stage))
+        counts = dict.fromkeys(self._out.observation_topics, n_observed)
+        counts |= self._commands.counts(episode.start_ns, end_ns)
         return EpisodeEvent(
-            run.id,
-            run.name,
-            kind,  # type: ignore[arg-type]  # one of the two
-            run.start_ns,
+            episode.id,
+            episode.name,
+            "aborted" if episode.reason else "ended",
+            episode.start_ns,
             end_ns,
             counts,
-            reason=reason,
+            reason=f"aborted: {episode.reason}" if episode.reason else "",
         )

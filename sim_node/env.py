@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from curation_ros.core.errors import ConfigError, SimError
 from curation_ros.core.types import Floats
 from sim_node import compiled_task, quiet_libero
+from sim_node.environment import GRIPPER_OPEN, Observation
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -28,10 +29,6 @@ _LOGGER = logging.getLogger(__name__)
 CONTROL_RATE_HZ = 20
 N_SETTLE_STEPS = 10
 """Steps with open gripper after a reset: start states hold the objects above the table."""
-
-GRIPPER_OPEN = -1.0
-GRIPPER_HOLD = 0.0
-GRIPPER_CLOSE = 1.0
 
 BOWL = "akita_black_bowl_1"
 PLATE = "plate_1"
@@ -43,43 +40,6 @@ _DIVERGED = {
     int(mujoco.mjtWarning.mjWARN_BADCTRL): "torque",
 }
 _XYZW_OF_WXYZ = np.array([1, 2, 3, 0])
-
-
-@dataclass(frozen=True)
-class Observation:
-    """What the robot's sensors and a perfect object tracker say at one instant.
-
-    Positions are in the world frame. The effector is the grip site between the finger tips,
-    position and orientation. Efforts are the actuators' torques (gravity compensation included)
-    and forces in the substep that led here.
-
-    Attributes:
-        eef_position_m: (3,) position of the effector.
-        eef_quat_xyzw: (4,) orientation of the effector.
-        joint_position_rad: (7,) arm.
-        joint_velocity_rad_s: (7,) arm.
-        joint_effort_nm: (7,) arm.
-        finger_position_m: (2,) fingers, first >= 0, second <= 0.
-        finger_velocity_m_s: (2,) fingers.
-        finger_effort_n: (2,) fingers.
-        objects: position (3,) in m and quaternion (4,) xyzw of each movable object, by its
-            LIBERO name.
-    """
-
-    eef_position_m: Floats
-    eef_quat_xyzw: Floats
-    joint_position_rad: Floats
-    joint_velocity_rad_s: Floats
-    joint_effort_nm: Floats
-    finger_position_m: Floats
-    finger_velocity_m_s: Floats
-    finger_effort_n: Floats
-    objects: dict[str, tuple[Floats, Floats]]
-
-    @property
-    def finger_width_m(self) -> float:
-        """Distance between the fingers: 0.08 open, 0.008 on the bowl's rim, 0 closed."""
-        return float(self.finger_position_m[0] - self.finger_position_m[1])
 
 
 class _Stepper(Protocol):
@@ -258,10 +218,6 @@ class LiberoEnv:
         An open gripper is no part of it.
         """
         return self._open_stepper().is_success()
-
-    def is_finite(self) -> bool:
-        """Whether state and warnings say that the simulation has not diverged."""
-        return self._divergence() is None
 
     def close(self) -> None:
         """Free the simulator; a second call does nothing."""

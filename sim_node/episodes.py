@@ -1,45 +1,60 @@
-"""Plan episodes, and run them in this process, in the very order of steps of the ROS node."""
+"""The episode loop: reset, observe, track the phase, get a command, execute it, until the end.
+
+Nodes, collections and rollouts all run this one loop. It asks a pilot for each command. A pilot is
+a generator, so it can wait for messages between two steps. Where nothing has to be waited for,
+`run_episode` runs the loop to its end at once.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
-
-import numpy as np
+from typing import TypeVar
 
 from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.errors import ConfigError
-from curation_ros.core.types import Floats
-from sim_node.defects import DEFECTS, DefectiveController
-from sim_node.env import LiberoEnv, Observation
-from sim_node.expert import Controller, Expert, ExpertParams
+from sim_node.environment import Command, Environment
 from sim_node.phases import PhaseTracker
 from sim_node.starts import Start
+from sim_node.tasks.task import Controller, Step
 
 MAX_STEPS = 500
+"""Most commands of an episode, unless somebody asks for another number."""
+
 STEPS_AFTER_SUCCESS = 20
-"""A demonstration goes on for a second, so that it shows what success looks like."""
+"""Commands after success: a demonstration goes on for 1 s, to show what success looks like."""
+
+Returned = TypeVar("Returned")
 
 
 @dataclass(frozen=True)
-class Step:
-    """One step: what was seen, in which phase, and the command that answered it.
+class EpisodeLimits:
+    """When an episode ends.
 
     Attributes:
-        index: from 0.
-        observation: before the command.
-        phase_index: in `PHASES`.
-        phase_progress: in [0, 1].
-        action_xyz: (3,) in [-1, 1].
-        gripper: -1, 0 or +1.
+        max_steps: most commands, at least 1.
+        steps_after_success: commands after the one that succeeded; 0 for rollouts of policies.
     """
 
-    index: int
-    observation: Observation
-    phase_index: int
-    phase_progress: float
-    action_xyz: Floats
-    gripper: float
+    max_steps: int = MAX_STEPS
+    steps_after_success: int = STEPS_AFTER_SUCCESS
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ConfigError: if one is out of range.
+        """
+        if self.max_steps < 1 or self.steps_after_success < 0:
+            raise ConfigError(
+                f"max_steps must be >= 1 and steps_after_success >= 0, "
+                f"got {self.max_steps} and {self.steps_after_success}"
+            )
+
+
+Pilot = Callable[[Step], Generator[bool, None, Command | None]]
+"""Answers a step with a command; None ends the episode. It yields while it waits, and it yields
+True to be resumed at once."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +67,9 @@ class EpisodeResult:
         is_success_at_end: whether it held after the last step.
         n_steps: commands executed.
         success_step: index of the command after which the goal held for the first time.
-        stage: name of the phase that was reached.
+        stage: name of the last phase reached.
         phase_steps: steps in each phase.
-        given_up: why it was ended before its time; empty where it was not.
+        given_up: why the episode was ended before its time; empty if it was not.
     """
 
     start: str
@@ -67,152 +82,126 @@ class EpisodeResult:
     given_up: str = ""
 
 
-@dataclass(frozen=True)
-class EpisodePlan:
-    """One episode to collect.
+class Run:
+    """One episode, while it runs and afterwards; its state stays readable if it is cut short.
+
+    Args:
+        env: reset by this constructor, and stepped by `play`.
+        start: where to start.
+        limits: when to end.
 
     Attributes:
-        index: place in the order of collection.
-        start: name of the start state.
-        repetition: how many earlier episodes of the plan have the same start and defect.
-        defect: key of `DEFECTS`.
-        expert_seed: of the expert's variation.
-        seed: of the defect's variation.
+        n_steps: commands executed so far.
+        success_step: index of the command after which the goal held for the first time.
+        is_success_now: whether the goal held after the last command.
+        stage: name of the phase reached; empty before the first step.
+        phase_steps: steps in each phase so far.
+
+    Raises:
+        SimError: if the start state is invalid or the simulation diverges while it settles.
     """
 
-    index: int
-    start: str
-    repetition: int
-    defect: str
-    expert_seed: int
-    seed: int
+    def __init__(self, env: Environment, start: Start, limits: EpisodeLimits) -> None:
+        self._env = env
+        self._limits = limits
+        self._first = env.reset(start.state)
+        self._tracker = PhaseTracker.from_observation(self._first)
+        self.start = start
+        self.n_steps = 0
+        self.success_step: int | None = None
+        self.is_success_now = False
+        self.stage = ""
+        self.phase_steps = [0] * len(PHASES)
 
-    def controller(self, params: ExpertParams | None = None) -> DefectiveController:
-        """The expert of this episode, with its defect."""
-        return DEFECTS[self.defect].inject(Expert(self.expert_seed, params), self.seed)
+    def play(self, pilot: Pilot) -> Generator[bool, None, None]:
+        """Run the loop; call once.
+
+        Args:
+            pilot: asked for the command of each step.
+
+        Raises:
+            SimError: if the simulation diverged.
+        """
+        env, tracker, limits = self._env, self._tracker, self._limits
+        observation = self._first
+        while self.n_steps < limits.max_steps:
+            phase_index = tracker.update(observation)
+            self.stage = tracker.name
+            step = Step(self.n_steps, observation, phase_index, self.stage, tracker.progress)
+            command = yield from pilot(step)
+            if command is None:
+                return
+            observation = env.step(*command)
+            self.phase_steps[phase_index] += 1
+            self.n_steps += 1
+            self.is_success_now = env.is_success()
+            if self.is_success_now and self.success_step is None:
+                self.success_step = self.n_steps - 1
+            if (
+                self.success_step is not None
+                and self.n_steps > self.success_step + limits.steps_after_success
+            ):
+                return
+
+    def result(self, given_up: str = "") -> EpisodeResult:
+        """How the episode went so far."""
+        return EpisodeResult(
+            start=self.start.name,
+            is_success=self.success_step is not None,
+            is_success_at_end=self.is_success_now,
+            n_steps=self.n_steps,
+            success_step=self.success_step,
+            stage=self.stage,
+            phase_steps=tuple(self.phase_steps),
+            given_up=given_up,
+        )
 
 
 def run_episode(
-    env: LiberoEnv,
+    env: Environment,
     start: Start,
     controller: Controller,
+    limits: EpisodeLimits | None = None,
     *,
-    max_steps: int = MAX_STEPS,
-    steps_after_success: int = STEPS_AFTER_SUCCESS,
-    on_step: Callable[[Step], None] | None = None,
+    on_step: Callable[[Step, Command], None] | None = None,
     give_up: Callable[[Step], str] | None = None,
 ) -> EpisodeResult:
-    """Reset, then observe, track the phase, ask for a command and execute it, until the end.
+    """Run one episode in this process, without waiting for anything.
 
     Args:
         env: reset by this function.
         start: where to start.
         controller: one that has not acted yet.
-        max_steps: most commands.
-        steps_after_success: commands after the one that succeeded; 0 for evaluating policies.
+        limits: when to end; default: those of a demonstration.
         on_step: called before each command is executed.
-        give_up: called before each command that is executed; a reason ends the episode instead.
+        give_up: called before each command until the first success; a reason ends the episode
+            instead of the command.
 
     Raises:
-        ConfigError: if max_steps is not positive or steps_after_success is negative.
         SimError: if the simulation diverged.
     """
-    if max_steps < 1 or steps_after_success < 0:
-        raise ConfigError(
-            f"max_steps must be >= 1 and steps_after_success >= 0, "
-            f"got {max_steps} and {steps_after_success}"
-        )
-    observation = env.reset(start.state)
-    tracker = PhaseTracker.from_observation(observation)
-    phase_steps = [0] * len(PHASES)
-    success_step: int | None = None
-    is_success = False
+    run = Run(env, start, limits or EpisodeLimits())
     given_up = ""
-    n_steps = 0
-    while n_steps < max_steps:
-        phase_index = tracker.update(observation)
-        action_xyz, gripper = controller.act(observation, phase_index)
-        step = Step(n_steps, observation, phase_index, tracker.progress, action_xyz, gripper)
-        if give_up is not None and success_step is None and (given_up := give_up(step)):
-            break
+
+    def pilot(step: Step) -> Generator[bool, None, Command | None]:
+        nonlocal given_up
+        command = Command(*controller.act(step))
+        if give_up is not None and run.success_step is None and (given_up := give_up(step)):
+            return None
         if on_step is not None:
-            on_step(step)
-        observation = env.step(action_xyz, gripper)
-        phase_steps[phase_index] += 1
-        n_steps += 1
-        is_success = env.is_success()
-        if is_success and success_step is None:
-            success_step = n_steps - 1
-        if success_step is not None and n_steps > success_step + steps_after_success:
-            break
-    return EpisodeResult(
-        start=start.name,
-        is_success=success_step is not None,
-        is_success_at_end=is_success,
-        n_steps=n_steps,
-        success_step=success_step,
-        stage=tracker.name,
-        phase_steps=tuple(phase_steps),
-        given_up=given_up,
-    )
+            on_step(step, command)
+        return command
+        yield  # a pilot is a generator; this one never waits
+
+    run_to_end(run.play(pilot))
+    return run.result(given_up)
 
 
-def plan_episodes(
-    n: int,
-    contamination: float,
-    defect: str,
-    seed: int,
-    starts: Sequence[str],
-    *,
-    paired: bool = True,
-) -> list[EpisodePlan]:
-    """Decide what to collect, in which order.
-
-    Args:
-        n: episodes.
-        contamination: fraction of defective ones; round(n * contamination) of them.
-        defect: key of `DEFECTS` for the defective ones.
-        seed: of the order and of every episode's own seeds.
-        starts: names of start states.
-        paired: the defective episodes recur on the starts of the clean ones, so that a start says
-            nothing about the label; otherwise each episode takes the next start. Either way the
-            starts begin anew where they run out.
-
-    Raises:
-        ConfigError: if a value is out of range or the defect is unknown.
-    """
-    if n < 1 or not 0.0 <= contamination <= 1.0:
-        raise ConfigError(f"need n >= 1 and contamination in [0, 1], got {n}, {contamination}")
-    if seed < 0:
-        raise ConfigError(f"seed must be >= 0, got {seed}")
-    if defect not in DEFECTS:
-        raise ConfigError(f"defect {defect!r} is unknown; known: {', '.join(DEFECTS)}")
-    if not starts:
-        raise ConfigError("no start states to plan with")
-    n_defective = round(n * contamination)
-    n_clean = n - n_defective
-    pool = starts[:n_clean] if paired and n_clean else starts
-    chosen = [("none", starts[i % len(starts)]) for i in range(n_clean)]
-    first = 0 if paired else n_clean
-    chosen += [(defect, pool[(first + i) % len(pool)]) for i in range(n_defective)]
-
-    seen: dict[tuple[str, str], int] = {}
-    drafts = []
-    for kind, start in chosen:
-        drafts.append((kind, start, seen.get((kind, start), 0)))
-        seen[kind, start] = drafts[-1][2] + 1
-    rng = np.random.default_rng(seed)
-    order = rng.permutation(n)
-    # Seeds are drawn after the order: they belong to the place in it, not to the kind.
-    seeds = rng.integers(0, 2**31, size=(n, 2))
-    return [
-        EpisodePlan(
-            index=index,
-            start=drafts[draft][1],
-            repetition=drafts[draft][2],
-            defect=drafts[draft][0],
-            expert_seed=int(seeds[index, 0]),
-            seed=int(seeds[index, 1]),
-        )
-        for index, draft in enumerate(order)
-    ]
+def run_to_end(script: Generator[bool, None, Returned]) -> Returned:
+    """Run a script that has nothing to wait for, and return what it returns."""
+    while True:
+        try:
+            next(script)
+        except StopIteration as end:
+            value: Returned = end.value
+            return value

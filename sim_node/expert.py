@@ -8,29 +8,15 @@ demonstrations differ in length and shape and still succeed.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.types import Floats
 from sim_node import phases
-from sim_node.env import BOWL, GRIPPER_CLOSE, GRIPPER_OPEN, PLATE, Observation
-
-
-class Controller(Protocol):
-    """Whatever drives the robot. One object an episode; one call a step, in order."""
-
-    def act(self, observation: Observation, phase_index: int) -> tuple[Floats, float]:
-        """The command that answers an observation.
-
-        Args:
-            observation: of this step.
-            phase_index: what the episode's `PhaseTracker` says of this observation.
-
-        Returns:
-            (3,) action in [-1, 1] and gripper command in {-1, 0, +1}.
-        """
+from sim_node.env import BOWL, PLATE
+from sim_node.environment import GRIPPER_CLOSE, GRIPPER_OPEN, Observation
+from sim_node.tasks.task import Step
 
 
 @dataclass(frozen=True)
@@ -99,8 +85,9 @@ class Expert:
         self._grasp_m: Floats | None = None
         self._place_m: Floats | None = None
 
-    def act(self, observation: Observation, phase_index: int) -> tuple[Floats, float]:
-        """The command that answers an observation; see `Controller`."""
+    def act(self, step: Step) -> tuple[Floats, float]:
+        """The command that answers a step; see `Controller`."""
+        observation, phase_index = step.observation, step.phase_index
         if phase_index != self._phase:
             self._phase = phase_index
             self._steps_in_phase = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,11 @@ from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import LATCHED, MAPPED
 from curation_ros.nodes.spinning import Finished, run
 from sim_node.defects import DEFECTS
-from sim_node.driving import Commands, Driver, Run
+from sim_node.driving import Commands, DrivenEpisode, Driver, DriveSettings
 from sim_node.env import LiberoEnv
-from sim_node.episodes import EpisodePlan, plan_episodes
+from sim_node.episodes import MAX_STEPS, STEPS_AFTER_SUCCESS
 from sim_node.output import COMMAND_TOPICS
+from sim_node.planning import EpisodePlan, plan_episodes
 from sim_node.publishing import SimPublishers
 from sim_node.starts import parse_starts
 
@@ -39,9 +41,9 @@ PARAMETERS = (
     Parameter("defect", "early_release", "what is wrong with those", choices=tuple(DEFECTS)),
     Parameter("paired", False, "defective demonstrations recur on the starts of clean ones"),
     Parameter("starts", "", "official:0:50 or generated:SEED:COUNT; empty: generated, by seed"),
-    Parameter("max_steps", 500, "steps after which an episode ends", 1, 100_000),
+    Parameter("max_steps", MAX_STEPS, "steps after which an episode ends", 1, 100_000),
     Parameter("max_steps_defective", 0, "the same where a defect is in; 0: max_steps", 0, 100_000),
-    Parameter("steps_after_success", 20, "steps recorded after success", 0, 1000),
+    Parameter("steps_after_success", STEPS_AFTER_SUCCESS, "steps recorded after success", 0, 1000),
     Parameter("dataset", "", "its truth.jsonl gets the outcomes; empty: they are not written"),
     Parameter("realtime_factor", 1.0, "speed when free", 0.01, 100.0),
     Parameter("hold_timeout_s", 0.5, "free: an older command becomes zero, s", 0.0, 60.0),
@@ -78,7 +80,8 @@ class SimNode(Node):
         self.get_logger().info(f"LIBERO and {len(starts)} starts ready in {ready_s:.1f} s")
         self._out = SimPublishers(self, self._env, owner=p["episodes"] > 0, expert=self._expert)
         self._commands = Commands()
-        self._driver = Driver(self._env, self._out, self._commands, p, self._announced, self._deaf)
+        settings = DriveSettings(**{field.name: p[field.name] for field in fields(DriveSettings)})
+        self._driver = Driver(self._env, self._out, self._commands, settings, peers=self)
         self._is_recorded = p["episodes"] > 0 and "recorder" in p["wait_for"]
         self._recorder: dict[str, Status] = {}
         self._outcomes: list[str] = []
@@ -137,7 +140,7 @@ class SimNode(Node):
         while True:
             for plan in self._plans:
                 name = f"{self._p['task']}-{number:04d}"
-                episode = yield from self._driver.run(plan, self._starts[plan.start], name)
+                episode = yield from self._driver.drive(plan, self._starts[plan.start], name)
                 number += 1
                 self._report(episode)
                 yield from self._until_recorder(episode.id, "closed", "failed")
@@ -146,27 +149,32 @@ class SimNode(Node):
                 self.get_logger().info(f"{n} of {len(self._outcomes)} episodes succeeded")
                 return
 
-    def _announced(self, episode_id: str) -> Iterator[bool]:
+    def wait_for_recorder(self, episode_id: str) -> Iterator[bool]:
+        """Wait until the recorder, if it is one to wait for, records an episode."""
         return self._until_recorder(episode_id, "recording", "closed", "failed")
 
-    def _deaf(self, episode_id: str) -> str:
-        """The recorder until it has each of our topics in an episode, and which it has not."""
-        said = self._recorder.get(episode_id)
-        if not self._is_recorded or said is None or not said.message.startswith("recording"):
+    def unconfirmed(self, episode_id: str) -> str:
+        """The recorder and our topics of which it has nothing yet in an episode, or empty."""
+        status = self._recorder.get(episode_id)
+        if not self._is_recorded or status is None or not status.message.startswith("recording"):
             return ""
-        counts = counts_from_status(said)  # of the topics that it knows
+        counts = counts_from_status(status)  # of the topics that it records
         ours = (*COMMAND_TOPICS, *self._out.observation_topics)
         missing = [topic for topic in ours if counts.get(topic) == 0]
         if not counts or not missing:
             return "" if counts else "recorder"
         return f"recorder on {' and '.join(missing)}"
 
+    def several_commanders(self) -> str:
+        """Names of the nodes that send commands if there are several, or empty."""
+        return self._out.several_commanders()
+
     def _until_recorder(self, episode_id: str, *states: str) -> Iterator[bool]:
-        """Wait for the recorder to say that of an episode, if it is in the game."""
+        """Wait until the recorder reports one of these states of an episode."""
 
         def missing() -> list[str]:
-            said = self._recorder.get(episode_id)
-            state = said.message.partition(" ")[0] if said is not None else ""
+            status = self._recorder.get(episode_id)
+            state = status.message.partition(" ")[0] if status is not None else ""
             return [] if state in states else ["recorder"]
 
         if self._is_recorded:
@@ -181,9 +189,9 @@ class SimNode(Node):
                 self.get_logger().info(f"waiting for {', '.join(names)}")
             yield False
 
-    def _report(self, episode: Run) -> None:
-        """Outcome and truth, apart from the data."""
-        steps = f"{episode.executed} steps, reset {1e3 * self._env.reset_s:.0f} ms"
+    def _report(self, episode: DrivenEpisode) -> None:
+        """Log and publish the outcome; write the truth, apart from the data."""
+        steps = f"{episode.run.n_steps} steps, reset {1e3 * episode.reset_s:.0f} ms"
         # rclpy refuses a line of code that logs with two severities.
         if episode.reason:
             self.get_logger().error(f"{episode.name}: {episode.reason} ({steps})")

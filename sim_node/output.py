@@ -6,8 +6,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 
 from curation_ros.core.episode.status import EpisodeEvent, Status, phase_to_status
-from sim_node.env import LiberoEnv, Observation
-from sim_node.phases import PhaseTracker
+from sim_node.environment import Environment
+from sim_node.tasks.task import Step
 
 COMMAND_TOPICS = ("command/twist", "command/gripper")
 GRIPPER_JOINT = "gripper"
@@ -23,7 +23,7 @@ class SimOutput(ABC):
         observation_topics: every topic that has a message for each observation.
     """
 
-    def __init__(self, env: LiberoEnv) -> None:
+    def __init__(self, env: Environment) -> None:
         self._env = env
         self._object_topics = {name: f"objects/{name}/pose" for name in env.object_names}
         self.observation_topics = (
@@ -33,10 +33,9 @@ class SimOutput(ABC):
             *self._object_topics.values(),
         )
 
-    def observation(
-        self, stamp_ns: int, o: Observation, tracker: PhaseTracker, episode_id: str
-    ) -> None:
-        """Say everything that is seen at one stamp."""
+    def observation(self, stamp_ns: int, step: Step, episode_id: str) -> None:
+        """Send everything that is observed at one stamp."""
+        o = step.observation
         self._joints(
             "joint_states",
             self._env.joint_names,
@@ -47,7 +46,7 @@ class SimOutput(ABC):
         )
         for name, topic in self._object_topics.items():
             self._pose(topic, *o.objects[name], stamp_ns)
-        phase = phase_to_status(episode_id, tracker.name, tracker.index, tracker.progress)
+        phase = phase_to_status(episode_id, step.phase_name, step.phase_index, step.phase_progress)
         self._status("phase", phase, stamp_ns)
         # The clock-role topic goes last: who has it has, of a fast writer, mostly the rest too.
         self._pose("eef_pose", o.eef_position_m, o.eef_quat_xyzw, stamp_ns)
@@ -61,10 +60,6 @@ class SimOutput(ABC):
     @abstractmethod
     def event(self, event: EpisodeEvent) -> None:
         """Say an event of an episode."""
-
-    @abstractmethod
-    def several_commanders(self) -> str:
-        """Who commands, if they are several; empty if there is one."""
 
     @abstractmethod
     def _joints(

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.types import Floats
-from sim_node.env import BOWL, PLATE, Observation
+from sim_node.env import BOWL, PLATE
+from sim_node.environment import Observation
 
 PREGRASP, DESCEND, GRASP, LIFT, TRANSPORT, RELEASE = range(len(PHASES))
 

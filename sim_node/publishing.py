@@ -21,9 +21,9 @@ from curation_ros.nodes.messages import (
     twist_to_ros,
 )
 from curation_ros.nodes.qos import EVENTS, LATCHED, MAPPED
-from sim_node.env import LiberoEnv, Observation
+from sim_node.environment import Environment
 from sim_node.output import COMMAND_TOPICS, SimOutput
-from sim_node.phases import PhaseTracker
+from sim_node.tasks.task import Step
 
 #: As rmw calls the node of a publisher that it cannot name yet.
 _UNNAMED = "_NODE_NAME_UNKNOWN_"
@@ -32,7 +32,7 @@ _UNNAMED = "_NODE_NAME_UNKNOWN_"
 class SimPublishers(SimOutput):
     """All publishers of the sim node; `episode` and the commands exist only for their owner."""
 
-    def __init__(self, node: Node, env: LiberoEnv, *, owner: bool, expert: bool) -> None:
+    def __init__(self, node: Node, env: Environment, *, owner: bool, expert: bool) -> None:
         """Make the publishers.
 
         Args:
@@ -57,12 +57,10 @@ class SimPublishers(SimOutput):
                 self._mapped[topic] = make(kind, topic, MAPPED)
         self._matching = Matching(node)
 
-    def observation(
-        self, stamp_ns: int, o: Observation, tracker: PhaseTracker, episode_id: str
-    ) -> None:
-        """Publish everything that is seen at one stamp, the clock first."""
+    def observation(self, stamp_ns: int, step: Step, episode_id: str) -> None:
+        """Publish everything that is observed at one stamp, the clock first."""
         self._clock.publish(Clock(clock=time_to_ros(stamp_ns)))
-        super().observation(stamp_ns, o, tracker, episode_id)
+        super().observation(stamp_ns, step, episode_id)
 
     def _joints(
         self,

@@ -16,7 +16,8 @@ import numpy as np
 from curation_ros.core.errors import ConfigError, SimError
 from curation_ros.core.types import Floats
 from sim_node import quiet_libero
-from sim_node.env import BOWL, PLATE, LiberoEnv, Observation
+from sim_node.env import BOWL, PLATE, LiberoEnv
+from sim_node.environment import Observation
 
 N_OFFICIAL = 50
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import fcntl
 import time
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -29,17 +29,17 @@ from curation_ros.core.errors import BagError, ConfigError, CurationError
 from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.live.recorder import Notice, RecordedTopic, Recording, recover_partials
-from sim_node.driving import Commands, Driver
-from sim_node.env import CONTROL_RATE_HZ, LiberoEnv, process_env
-from sim_node.episodes import MAX_STEPS, STEPS_AFTER_SUCCESS, EpisodePlan, plan_episodes
+from sim_node.driving import Commands, Driver, DriveSettings
+from sim_node.env import CONTROL_RATE_HZ, process_env
+from sim_node.environment import Environment
+from sim_node.episodes import MAX_STEPS, STEPS_AFTER_SUCCESS, run_to_end
 from sim_node.output import SimOutput
+from sim_node.planning import EpisodePlan, plan_episodes
 from sim_node.starts import start_by_name, start_names
 
 #: As `curation_ros.nodes.qos.MAPPED`, by which the graph's recorder subscribes.
 _QOS = QosProfile(depth=1000)
 _FRAME = "world"
-
-Returned = TypeVar("Returned")
 
 
 @dataclass(frozen=True)
@@ -70,18 +70,23 @@ class Collection:
     max_steps_defective: int = 0
     steps_after_success: int = STEPS_AFTER_SUCCESS
 
+    @property
+    def drive_settings(self) -> DriveSettings:
+        """How the episodes are driven."""
+        return DriveSettings(
+            max_steps=self.max_steps,
+            max_steps_defective=self.max_steps_defective,
+            steps_after_success=self.steps_after_success,
+        )
+
     def plan(self) -> dict[str, EpisodePlan]:
         """Episodes by their short names, in order.
 
         Raises:
             ConfigError: if a value makes no sense.
         """
-        if self.max_steps < 1 or self.max_steps_defective < 0 or self.steps_after_success < 0:
-            raise ConfigError(
-                f"collection: max_steps {self.max_steps}, max_steps_defective "
-                f"{self.max_steps_defective}, steps_after_success {self.steps_after_success}: "
-                "expected at least 1, 0 and 0"
-            )
+        for defect in ("none", self.defect):
+            self.drive_settings.limits(defect)
         plans = plan_episodes(
             self.episodes,
             self.contamination,
@@ -206,24 +211,15 @@ def _collect(
     try:
         dataset = Dataset(folder)
         output = RecordedOutput(process_env(), dataset)
-        settings = {"mode": "expert", "sync": "lockstep", **vars(collection)}
-        driver = Driver(process_env(), output, Commands(), settings, stamp_ns=stamp_ns)
-        run = _returned(driver.run(plan, start_by_name(plan.start), name, episode_id))
+        driver = Driver(
+            process_env(), output, Commands(), collection.drive_settings, stamp_ns=stamp_ns
+        )
+        episode = run_to_end(driver.drive(plan, start_by_name(plan.start), name, episode_id))
         output.check_closed()
-        dataset.append_truth(run.truth())
+        dataset.append_truth(episode.truth())
     except CurationError as err:
         return Collected(name, None, str(err))
-    return Collected(name, run.truth(), run.reason)
-
-
-def _returned(script: Generator[bool, None, Returned]) -> Returned:
-    """What a script of the sim node returns where there is nothing to wait for."""
-    while True:
-        try:
-            next(script)
-        except StopIteration as end:
-            value: Returned = end.value
-            return value
+    return Collected(name, episode.truth(), episode.reason)
 
 
 class RecordedOutput(SimOutput):
@@ -234,7 +230,7 @@ class RecordedOutput(SimOutput):
         dataset: where the bag of each episode goes.
     """
 
-    def __init__(self, env: LiberoEnv, dataset: Dataset) -> None:
+    def __init__(self, env: Environment, dataset: Dataset) -> None:
         super().__init__(env)
         topic_map = topic_map_or_default("")
         topics = {t: RecordedTopic(f"/{t}", kind, _QOS) for t, kind in topic_map.topics.items()}
@@ -255,10 +251,6 @@ class RecordedOutput(SimOutput):
     def event(self, event: EpisodeEvent) -> None:
         """Open or close a bag."""
         self._heard(self._recording.event(event, time.monotonic()))
-
-    def several_commanders(self) -> str:
-        """Nobody but the expert commands."""
-        return ""
 
     def _joints(
         self,

@@ -36,7 +36,7 @@ from policy_node.policy import Policy  # noqa: E402 - needs safetensors
 from policy_node.rollouts import SimController, field_values  # noqa: E402 - needs LIBERO
 from policy_node.train import train  # noqa: E402 - needs torch
 from sim_node.env import LiberoEnv  # noqa: E402 - needs LIBERO
-from sim_node.episodes import run_episode  # noqa: E402 - needs LIBERO
+from sim_node.episodes import EpisodeLimits, run_episode  # noqa: E402 - needs LIBERO
 from sim_node.starts import parse_starts  # noqa: E402 - needs LIBERO
 
 START = "generated:5:1"
@@ -99,16 +99,15 @@ def driven(graph, folder):
 
 @pytest.fixture(scope="module")
 def in_process(folder):
-    """Steps of the same policy from the same start, and how it went."""
+    """Steps and commands of the same policy from the same start, and how it went."""
     steps = []
     with LiberoEnv() as env:
         result = run_episode(
             env,
             parse_starts(START)[0],
             SimController(Policy.load(folder)),
-            max_steps=MAX_STEPS,
-            steps_after_success=0,
-            on_step=steps.append,
+            EpisodeLimits(MAX_STEPS, steps_after_success=0),
+            on_step=lambda step, command: steps.append((step, command)),
         )
     return steps, result
 
@@ -127,10 +126,10 @@ def test_graph_and_one_process_go_the_same_way(driven, in_process):
     steps, result = in_process
     episode = driven.episode
     assert len(episode) == len(steps)
-    np.testing.assert_array_equal(episode.field("twist"), [s.action_xyz for s in steps])
-    np.testing.assert_array_equal(episode.field("gripper")[:, 0], [s.gripper for s in steps])
-    np.testing.assert_array_equal(episode.field("phase")[:, 0], [s.phase_index for s in steps])
-    seen = [field_values(s.observation) for s in steps]
+    np.testing.assert_array_equal(episode.field("twist"), [c.action_xyz for _, c in steps])
+    np.testing.assert_array_equal(episode.field("gripper")[:, 0], [c.gripper for _, c in steps])
+    np.testing.assert_array_equal(episode.field("phase")[:, 0], [s.phase_index for s, _ in steps])
+    seen = [field_values(s.observation) for s, _ in steps]
     for name in seen[0]:
         np.testing.assert_array_equal(episode.field(name), [values[name] for values in seen])
     # It grasped and let go: what is compared is more than a reach into the air.

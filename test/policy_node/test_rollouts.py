@@ -73,12 +73,14 @@ def test_success_ends_the_rollout(env, start, monkeypatch):
 def test_a_dropped_bowl_is_given_up_and_a_carried_one_is_not(env, start, defect, why):
     from policy_node.rollouts import GiveUp
     from sim_node.defects import DEFECTS
-    from sim_node.episodes import run_episode
+    from sim_node.episodes import EpisodeLimits, run_episode
     from sim_node.expert import Expert
 
     def run(give_up):
         controller = DEFECTS[defect].inject(Expert(0), 0)
-        return run_episode(env, start, controller, steps_after_success=0, give_up=give_up)
+        return run_episode(
+            env, start, controller, EpisodeLimits(steps_after_success=0), give_up=give_up
+        )
 
     ended, whole = run(GiveUp()), run(None)
     assert ended.given_up == why

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim_node.env import BOWL, PLATE, Observation
+from curation_ros.core.episode.phases import PHASES
+from sim_node.env import BOWL, PLATE
+from sim_node.environment import Observation
+from sim_node.tasks.task import Step
 
 BOWL_START_M = np.array([-0.05, 0.20, 0.90])
 PLATE_START_M = np.array([0.06, 0.20, 0.90])
@@ -23,3 +26,9 @@ def observation_at(eef_position_m, width_m: float = 0.08, bowl_m=BOWL_START_M) -
         finger_effort_n=np.zeros(2),
         objects={BOWL: (np.asarray(bowl_m), upright), PLATE: (PLATE_START_M, upright)},
     )
+
+
+def step_at(eef_position_m, phase_index: int = 0, **observed) -> Step:
+    """A step of which only observation and phase matter."""
+    observation = observation_at(eef_position_m, **observed)
+    return Step(0, observation, phase_index, PHASES[phase_index], 0.0)

@@ -7,17 +7,17 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from hand_made_observations import BOWL_START_M, observation_at
+from hand_made_observations import BOWL_START_M, step_at
 
 from sim_node import phases
 from sim_node.defects import DEFECTS, EarlyRelease
-from sim_node.episodes import run_episode
+from sim_node.episodes import EpisodeLimits, run_episode
 from sim_node.expert import Expert
 from sim_node.starts import parse_starts
 
 
 class Closing:
-    def act(self, observation, phase_index):
+    def act(self, step):
         return np.zeros(3), 1.0
 
 
@@ -28,7 +28,7 @@ def test_registry_names_agree():
 @pytest.mark.parametrize("name", DEFECTS)
 def test_truth_is_json_and_names_the_defect(name):
     controller = DEFECTS[name].inject(Closing(), 0)
-    controller.act(observation_at([0.0, 0.0, 1.0]), 0)
+    controller.act(step_at([0.0, 0.0, 1.0]))
     assert json.loads(json.dumps(controller.truth()))["defect"] == name
 
 
@@ -40,21 +40,21 @@ def test_early_release_opens_at_its_fraction_of_the_lift_for_good(seed):
     low_m = phases.grasp_point(BOWL_START_M)[2] + 0.036
     high_m = phases.lift_end_height_m(BOWL_START_M)
     heights_m = np.linspace(low_m, high_m, 51)
-    controller.act(observation_at([0.0, 0.0, 1.2]), phases.PREGRASP)
-    grippers = [controller.act(observation_at([0.0, 0.0, z]), phases.LIFT)[1] for z in heights_m]
+    controller.act(step_at([0.0, 0.0, 1.2], phases.PREGRASP))
+    grippers = [controller.act(step_at([0.0, 0.0, z], phases.LIFT))[1] for z in heights_m]
     first = grippers.index(-1.0)
     assert first / 50 == pytest.approx(fraction, abs=0.021)
     assert set(grippers[:first]) == {1.0}
     assert set(grippers[first:]) == {-1.0}
     assert controller.truth()["release_step"] == first + 1
-    assert controller.act(observation_at([0.0, 0.0, low_m]), phases.TRANSPORT)[1] == -1.0
+    assert controller.act(step_at([0.0, 0.0, low_m], phases.TRANSPORT))[1] == -1.0
 
 
 @pytest.mark.sim
 def test_early_release_never_succeeds_and_runs_to_the_limit(env):
     for i, start in enumerate(parse_starts("generated:12:3")):
         controller = DEFECTS["early_release"].inject(Expert(i), i)
-        result = run_episode(env, start, controller, max_steps=400)
+        result = run_episode(env, start, controller, EpisodeLimits(400))
         assert not result.is_success
         assert result.n_steps == 400
         assert result.stage == "RELEASE"

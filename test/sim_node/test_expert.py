@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from hand_made_observations import observation_at
+from hand_made_observations import step_at
 
 from sim_node import phases
 from sim_node.episodes import run_episode
@@ -14,11 +14,11 @@ from sim_node.starts import parse_starts
 
 
 def test_same_seed_gives_the_same_commands_and_another_does_not():
-    path = [observation_at([0.01 * i - 0.2, 0.0, 1.1]) for i in range(30)]
+    path = [step_at([0.01 * i - 0.2, 0.0, 1.1]) for i in range(30)]
 
     def commands(seed: int) -> np.ndarray:
         expert = Expert(seed)
-        return np.array([expert.act(observation, 0)[0] for observation in path])
+        return np.array([expert.act(step)[0] for step in path])
 
     assert np.array_equal(commands(1), commands(1))
     assert not np.array_equal(commands(1), commands(2))
@@ -30,7 +30,7 @@ def test_commands_stay_in_range_and_close_the_gripper_in_three_phases():
         grippers = []
         for phase in range(6):
             for _ in range(5):
-                action, gripper = expert.act(observation_at([-0.2, 0.1, 1.2]), phase)
+                action, gripper = expert.act(step_at([-0.2, 0.1, 1.2], phase))
                 assert action.dtype == np.float64
                 assert np.abs(action).max() <= 0.3
             grippers.append(gripper)
@@ -38,12 +38,13 @@ def test_commands_stay_in_range_and_close_the_gripper_in_three_phases():
 
 
 def test_expert_does_not_notice_that_the_bowl_is_lost():
-    here = observation_at([0.0, 0.1, 1.0])
-    lost = observation_at([0.0, 0.1, 1.0], bowl_m=np.full(3, 9.0))
+    first = step_at([0.0, 0.1, 1.0])
+    here = step_at([0.0, 0.1, 1.0], phases.LIFT)
+    lost = step_at([0.0, 0.1, 1.0], phases.LIFT, bowl_m=np.full(3, 9.0))
     one, other = Expert(0), Expert(0)
-    one.act(here, 0)
-    other.act(here, 0)
-    assert np.array_equal(one.act(here, phases.LIFT)[0], other.act(lost, phases.LIFT)[0])
+    one.act(first)
+    other.act(first)
+    assert np.array_equal(one.act(here)[0], other.act(lost)[0])
 
 
 @pytest.mark.sim

@@ -21,7 +21,8 @@ pytest.importorskip("libero", reason="LIBERO is not installed")
 from curation_ros.study.collect import Collection, collect  # noqa: E402 - needs LIBERO
 from sim_node import phases  # noqa: E402
 from sim_node.defects import DEFECTS, Defect, NoDefect  # noqa: E402
-from sim_node.env import GRIPPER_OPEN, Observation  # noqa: E402
+from sim_node.environment import GRIPPER_OPEN  # noqa: E402
+from sim_node.tasks.task import Step  # noqa: E402
 
 SEED = 109
 NAMES = ("object_coupling", "grip_consistency", "phase_events")
@@ -32,18 +33,18 @@ class LateDrop(NoDefect):
 
     _n_steps = 0
 
-    def act(self, observation: Observation, phase_index: int) -> tuple[Any, float]:
-        action, gripper = super().act(observation, phase_index)
-        self._n_steps += phase_index == phases.TRANSPORT
+    def act(self, step: Step) -> tuple[Any, float]:
+        action, gripper = super().act(step)
+        self._n_steps += step.phase_index == phases.TRANSPORT
         return action, GRIPPER_OPEN if self._n_steps > 25 else gripper
 
 
 class MissedGrasp(NoDefect):
     """Goes up while it closes: the fingers close on nothing, above the rim."""
 
-    def act(self, observation: Observation, phase_index: int) -> tuple[Any, float]:
-        action, gripper = super().act(observation, phase_index)
-        if phase_index == phases.GRASP:
+    def act(self, step: Step) -> tuple[Any, float]:
+        action, gripper = super().act(step)
+        if step.phase_index == phases.GRASP:
             action = np.array([0.0, 0.0, 0.9])
         return action, gripper
 
