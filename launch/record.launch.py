@@ -1,4 +1,4 @@
-"""Demonstrations recorded and judged as they come: by the simulated expert, or of your robot.
+"""Records and curates demonstrations, of the simulated expert or of your robot.
 
 ros2 launch curation_ros record.launch.py episodes:=10 contamination:=0.5
 ros2 launch curation_ros record.launch.py sim:=false topic_map:=my_robot.yaml
@@ -22,15 +22,15 @@ from launch_ros.parameter_descriptions import ParameterValue
 _LAST_DECISION_S = 5.0
 
 ARGUMENTS = (
-    ("dataset", "dataset", "folder of the dataset; made where it does not exist"),
+    ("dataset", "dataset", "folder of the dataset; created if missing"),
     ("reference", "", "dataset or bag of trusted demonstrations; empty: none"),
     ("config", "", "YAML file of scorers and rule; empty: config/curation.yaml"),
     ("topic_map", "", "YAML file of the topic map; empty: the LIBERO robot of sim_node"),
-    ("sim", "true", "false: your robot publishes; start episodes by curation record"),
-    ("episodes", "10", "how many demonstrations the expert gives"),
-    ("contamination", "0.0", "fraction of them that are defective"),
-    ("defect", "early_release", "what is wrong with those"),
-    ("seed", "0", "of start states, order and defects"),
+    ("sim", "true", "false: your robot publishes; start episodes with curation record"),
+    ("episodes", "10", "number of demonstrations by the expert"),
+    ("contamination", "0.0", "fraction of defective demonstrations"),
+    ("defect", "early_release", "the defect that is injected into them"),
+    ("seed", "0", "seed of start states, order and defects"),
 )
 
 
@@ -42,19 +42,19 @@ def generate_launch_description() -> LaunchDescription:
         return ParameterValue(LaunchConfiguration(name), value_type=kind)
 
     def others_follow(event, context):
-        if context.is_shutdown:  # Ctrl-C has reached everybody
+        if context.is_shutdown:  # Ctrl-C has reached every node
             return []
         return [Shutdown(reason=f"{event.process_name} has ended with code {event.returncode}")]
 
     with_sim = LaunchConfiguration("sim")
     common = {"dataset": text("dataset")}
-    judged = {**common, "topic_map": text("topic_map")}
+    mapped = {**common, "topic_map": text("topic_map")}
     recorder = Node(
         package="curation_ros",
         executable="recorder",
         output="screen",
         on_exit=others_follow,
-        parameters=[{**judged, "auto": number("sim", bool)}],
+        parameters=[{**mapped, "auto": number("sim", bool)}],
     )
     curator = Node(
         package="curation_ros",
@@ -63,7 +63,7 @@ def generate_launch_description() -> LaunchDescription:
         on_exit=others_follow,
         parameters=[
             {
-                **judged,
+                **mapped,
                 "config": text("config"),
                 "reference": ParameterValue(["[", LaunchConfiguration("reference"), "]"]),
             }
@@ -103,10 +103,10 @@ def generate_launch_description() -> LaunchDescription:
                 DeclareLaunchArgument(name, default_value=default, description=description)
                 for name, default, description in ARGUMENTS
             ),
-            # Before it starts: a sim node that refuses its parameters is soon gone.
+            # Registered before the sim node starts: one that refuses its parameters ends at once.
             RegisterEventHandler(OnProcessExit(target_action=sim, on_exit=sim_has_ended)),
-            # First: where an argument is not the number it should be, launch gives up at that
-            # node, and leaves those that it has started running.
+            # First, because launch gives up at a node with an argument that is no number, and
+            # leaves the nodes running that it has already started.
             sim,
             recorder,
             curator,
