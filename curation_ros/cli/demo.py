@@ -254,7 +254,7 @@ class _Demo:
         if salvaged is None:
             return
         try:
-            from curation_ros.reporting.salvaged import save_salvage_figure
+            from curation_ros.reporting.salvage_picture import save_salvage_figure
         except ImportError:
             self.say("No picture of a salvaged episode: matplotlib is not installed.")
             return

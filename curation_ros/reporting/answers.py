@@ -1,39 +1,38 @@
-"""The answer in a few sentences: each holds a figure of `results.json`, and none is prepared."""
+"""The answer in a few sentences, composed from the values in `results.json`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from curation_ros.reporting.findings import (
-    Row,
-    at_keep,
+from curation_ros.core.types import JsonObject
+from curation_ros.reporting.cells import number, percent, place, points, probability
+from curation_ros.reporting.rows import (
     groups,
     has_scorers,
+    is_resolved,
+    kept_by_scorers,
     main_keep,
-    named,
-    stages,
+    row_named,
+    stages_of_kind,
 )
-from curation_ros.reporting.tables import number, percent, points, probability
-
-#: Below this an adjusted p counts.
-ALPHA = 0.05
 
 
-def answers(found: Row) -> list[str]:
-    """A few sentences; where data are missing they say so."""
+def answers(results: JsonObject) -> list[str]:
+    """The answer in a few sentences; they report missing data."""
     return [
-        _done(found),
-        *_harm(found),
-        *_decided(found),
-        *_detection(found),
-        *_claims(found),
-        *_looks(found),
+        _completeness(results),
+        *_harm(results),
+        *_curator(results),
+        *_detection(results),
+        *_contrasts(results),
+        *_rivals(results),
     ]
 
 
-def _done(found: Row) -> str:
-    budget = found["budget"]
-    missing = {s["name"]: s["missing"] for s in found["stages"] if s["missing"]}
+def _completeness(results: JsonObject) -> str:
+    """How many rollouts were done, and how many are missing."""
+    budget = results["budget"]
+    missing = {s["name"]: s["missing"] for s in results["stages"] if s["missing"]}
     text = f"{budget['rollouts']} rollouts of {budget['policies']} policies are done"
     if not missing:
         return f"{text}, and none that were planned are missing."
@@ -44,12 +43,15 @@ def _done(found: Row) -> str:
     )
 
 
-def _harm(found: Row) -> Iterator[str]:
-    """Whether the contamination hurts at all."""
-    for stage in (*stages(found, "confirm"), *stages(found, "protocol", "screen")):
+def _harm(results: JsonObject) -> Iterator[str]:
+    """Whether the defective demonstrations hurt at all."""
+    for stage in (
+        *stages_of_kind(results, "confirm"),
+        *stages_of_kind(results, "protocol", "screen"),
+    ):
         pairs = []
         for _, _, rows in groups(stage):
-            base, best = named(rows, "everything"), named(rows, "oracle")
+            base, best = row_named(rows, "everything"), row_named(rows, "oracle")
             if base and best and base["rate"] is not None and best["rate"] is not None:
                 pairs.append((base["rate"], best["rate"]))
         if pairs:
@@ -62,17 +64,18 @@ def _harm(found: Row) -> Iterator[str]:
     yield "There are no outcomes yet of both everything and oracle: whether it hurts is open."
 
 
-def _decided(found: Row) -> Iterator[str]:
-    """What the curator made of the pools by itself, where the study has asked it."""
-    asked = [pool["curator"]["verdicts"] for pool in found["pools"].values() if "curator" in pool]
-    if not asked:
+def _curator(results: JsonObject) -> Iterator[str]:
+    """What the curator decided without a reference, in studies that use its decisions."""
+    pools = [pool for pool in results["pools"].values() if "curator" in pool]
+    decided = [pool["curator"]["verdicts"] for pool in pools]
+    if not decided:
         return
 
     def total(verdict: str, label: str) -> int:
-        return sum(int(verdicts[verdict][label]) for verdicts in asked)
+        return sum(int(verdicts[verdict][label]) for verdicts in decided)
 
     n_good, n_defective = (
-        sum(total(verdict, label) for verdict in asked[0]) for label in ("good", "defective")
+        sum(total(verdict, label) for verdict in decided[0]) for label in ("good", "defective")
     )
     yield (
         f"Without a reference the curator keeps {total('keep', 'good')} of {n_good} good "
@@ -81,15 +84,15 @@ def _decided(found: Row) -> Iterator[str]:
     )
 
 
-def _detection(found: Row) -> Iterator[str]:
-    """Whether a better detector makes a better policy."""
-    for stage in stages(found, "protocol", "screen"):
+def _detection(results: JsonObject) -> Iterator[str]:
+    """Whether a scorer that detects better makes a better policy."""
+    for stage in stages_of_kind(results, "protocol", "screen"):
         rhos, best, worst, n = [], 0, 0, 0
         for pool, _, rows in groups(stage):
-            keep = main_keep(found, pool, rows)
+            keep = main_keep(results, pool, rows)
             done = [
                 r
-                for r in at_keep(rows, keep)
+                for r in kept_by_scorers(rows, keep)
                 if r["rate"] is not None and r["auroc"] is not None and r["scorer"] != "length"
             ]
             if len(done) < 3:
@@ -108,34 +111,36 @@ def _detection(found: Row) -> Iterator[str]:
             ]
         if n:
             yield (
-                f"Stage {stage['name']}{_look(stage)}: the scorer of the highest AUROC gives the "
-                f"best policy of all scorers in {best} of {n} and the worst in {worst} of {n} "
+                f"Stage {stage['name']}{_caveat(stage)}: the scorer of the highest AUROC gives "
+                f"the best policy of all scorers in {best} of {n} and the worst in {worst} of {n} "
                 f"({_places(n)}, ties count)" + _rhos(rhos) + "."
             )
             return
-    if next(stages(found, "protocol", "screen"), None) and has_scorers(found):
+    if next(stages_of_kind(results, "protocol", "screen"), None) and has_scorers(results):
         yield "Too few scorers have outcomes to compare detection with success."
 
 
-def _rhos(found: Sequence[Row]) -> str:
-    if not found:
+def _rhos(correlations: Sequence[JsonObject]) -> str:
+    """End of the sentence on detection: the rank correlations."""
+    if not correlations:
         return "; no rank correlation can be computed"
-    values = sorted(c["rho"] for c in found)
-    clear = [c for c in found if c["interval"] and (c["interval"][0] > 0 or c["interval"][1] < 0)]
+    values = sorted(c["rho"] for c in correlations)
+    intervals = [c["interval"] for c in correlations if c["interval"]]
+    n_clear = sum(low > 0 or high < 0 for low, high in intervals)
     low, high = number(values[0], 2), number(values[-1], 2)
     spread = low if low == high else f"{low} to {high}"
     return (
         f"; Spearman's rho of AUROC and success is {spread}, with an interval that excludes 0 in "
-        f"{len(clear)} of {len(found)}"
+        f"{n_clear} of {len(correlations)}"
     )
 
 
-def _claims(found: Row) -> Iterator[str]:
-    """What the planned contrasts resolve."""
-    for stage in stages(found, "confirm"):
+def _contrasts(results: JsonObject) -> Iterator[str]:
+    """Which planned contrasts are resolved."""
+    for stage in stages_of_kind(results, "confirm"):
         planned = stage["contrasts"]
         made = [c for c in planned if c.get("value") is not None]
-        clear = [c for c in made if c["p_holm"] is not None and c["p_holm"] < ALPHA]
+        clear = [c for c in made if is_resolved(c)]
         worst = max((c["p_holm"] for c in clear), default=None)
         yield (
             f"Of {len(planned)} planned contrasts {len(clear)} are resolved"
@@ -144,24 +149,24 @@ def _claims(found: Row) -> Iterator[str]:
         )
         where: dict[str, list[str]] = {}
         for c in clear:
-            said = f"{c['a']} minus {c['b']} {points(c['value'])}"
-            where.setdefault(f"{c['pool']}, {c['variant']}", []).append(said)
-        for place, differences in where.items():
-            yield f"Resolved in {place}, in percentage points: {', '.join(differences)}."
+            difference = f"{c['a']} minus {c['b']} {points(c['value'])}"
+            where.setdefault(place(c), []).append(difference)
+        for there, differences in where.items():
+            yield f"Resolved in {there}, in percentage points: {', '.join(differences)}."
 
 
-def _looks(found: Row) -> Iterator[str]:
-    """How many scorers are of use, by the rows that cost no more."""
-    for stage in stages(found, "protocol", "screen"):
+def _rivals(results: JsonObject) -> Iterator[str]:
+    """How many scorers beat the best row that needs no more than they do."""
+    for stage in stages_of_kind(results, "protocol", "screen"):
         judged = [r for r in stage["rows"] if r["rival"] is not None]
-        if not judged and not has_scorers(found):
+        if not judged and not has_scorers(results):
             continue
         if not judged:
             yield f"Stage {stage['name']} has no outcomes of scorers yet."
             continue
         ahead = [r for r in judged if r["rival"]["difference"] > 0]
         text = (
-            f"Stage {stage['name']}{_look(stage)}: {len(ahead)} of {len(judged)} rows with a "
+            f"Stage {stage['name']}{_caveat(stage)}: {len(ahead)} of {len(judged)} rows with a "
             "scorer succeed more often than the best row that needs no more"
         )
         if ahead:
@@ -173,8 +178,8 @@ def _looks(found: Row) -> Iterator[str]:
         yield text + "."
 
 
-def _look(stage: Row) -> str:
-    """What a sentence about a stage that confirms nothing says of itself."""
+def _caveat(stage: JsonObject) -> str:
+    """What limits a sentence about a stage that confirms nothing."""
     if stage["kind"] == "screen":
         return " (a look, not a claim)"
     return f" ({len(stage['seeds'])} training seeds)"

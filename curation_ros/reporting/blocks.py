@@ -1,4 +1,4 @@
-"""What a report is made of, before it is HTML or Markdown."""
+"""The parts of a report, before it becomes HTML or Markdown."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ from typing import TypeAlias
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph; `is_warning` where a reader must not miss it."""
+    """A paragraph; `is_warning` makes it stand out."""
 
     text: str
     is_warning: bool = False
 
 
+def missing(what: str) -> Text:
+    """A warning about something that a report would show if there were data."""
+    return Text(f"Missing: {what}", is_warning=True)
+
+
 @dataclass(frozen=True)
 class Points:
-    """A list."""
+    """A bulleted list."""
 
     items: tuple[str, ...]
 
@@ -26,10 +31,10 @@ class Table:
     """A table.
 
     Attributes:
-        caption: what it shows, in a line or two.
-        headings: of the columns.
-        rows: texts, as many in each as there are headings.
-        text: numbers of the columns that hold words and stand left; the others hold figures.
+        caption: what it shows.
+        headings: headings of the columns.
+        rows: one text per column in each.
+        text: indices of the columns that hold words, aligned left; the others are aligned right.
     """
 
     caption: str
@@ -40,7 +45,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Panel:
-    """A part of a figure, that can stand below the others on a narrow screen."""
+    """A part of a figure; on a narrow screen the parts stand below each other.
+
+    Attributes:
+        svg: SVG element for a page.
+        alt: what it shows, for people who cannot see it.
+    """
 
     svg: str
     alt: str
@@ -51,9 +61,9 @@ class Figure:
     """A figure.
 
     Attributes:
-        name: of its file, without `.svg`.
+        name: name of its file, without `.svg`.
         caption: what it shows and how to read it.
-        panels: its parts.
+        panels: its parts, for a page.
         whole: SVG of all parts side by side, for the file.
     """
 
@@ -68,7 +78,7 @@ Block: TypeAlias = Text | Points | Table | Figure
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and what is below it."""
+    """A heading and the blocks below it."""
 
     title: str
     blocks: tuple[Block, ...]

@@ -1,4 +1,4 @@
-"""A report as one HTML file that loads nothing."""
+"""A report as one HTML file that loads nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ thead th:first-child { left: 0; z-index: 3; }
   table { font-size: 6.5pt; } th, td { white-space: normal; padding: 0.1rem 0.2rem; }
   figure, tr { break-inside: avoid; } nav { display: none; } }
 """
-#: Words that are longer than this are wrapped in their cell.
+#: Texts longer than this are wrapped in their cell.
 _LONG = 40
 
 
-def html(page: Page) -> str:
-    """The whole file."""
+def to_html(page: Page) -> str:
+    """The whole HTML file."""
     contents = "".join(
         f'<li><a href="#part-{k}">{escape(s.title)}</a></li>'
         for k, s in enumerate(page.sections, 1)
@@ -113,7 +113,7 @@ def _table(table: Table) -> str:
         for k, h in enumerate(table.headings)
     )
     rows = "".join(f"<tr>{_cells(row, table.text)}</tr>\n" for row in table.rows)
-    # The caption stands outside, so that it does not scroll away with a wide table.
+    # Inside the table, the caption would scroll away with a wide one.
     return (
         f'<p class="caption">{escape(table.caption)}</p>\n'
         f'<div class="wide" tabindex="0"><table><thead><tr>{head}</tr></thead>\n'
@@ -122,7 +122,7 @@ def _table(table: Table) -> str:
 
 
 def _cells(row: tuple[str, ...], text: tuple[int, ...]) -> str:
-    # Where a long name of a row may be broken on a narrow screen.
+    # <wbr> marks where a narrow screen may break the long name of a row.
     name = escape(row[0]).replace("_", "_<wbr>")
     first = f'<th scope="row" class="text">{name}</th>'
     return first + "".join(

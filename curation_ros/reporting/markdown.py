@@ -1,4 +1,4 @@
-"""A report as Markdown; its figures are files beside it."""
+"""A report as Markdown; its figures are files in the same folder."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing_extensions import assert_never
 from curation_ros.reporting.blocks import Block, Figure, Page, Points, Table, Text
 
 
-def markdown(page: Page) -> str:
-    """The whole file."""
+def to_markdown(page: Page) -> str:
+    """The whole Markdown file."""
     parts = [f"# {_plain(page.title)}", _plain(page.subtitle)]
     for k, section in enumerate(page.sections, 1):
         parts.append(f"## {k}. {_plain(section.title)}")
@@ -45,5 +45,5 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text that Markdown takes for text."""
+    """Text in which nothing is Markdown syntax."""
     return re.sub(r"([\\`*_<>|#])", r"\\\1", " ".join(text.split()))

@@ -1,4 +1,4 @@
-"""The section of a report on what the curator decides, and on what it salvages."""
+"""The section of a report on the decisions of the curator and on salvage."""
 
 from __future__ import annotations
 
@@ -12,43 +12,48 @@ from curation_ros.core.decision.balance import LEAST_SHARE
 from curation_ros.core.decision.decision import VERDICTS, Decision
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError
-from curation_ros.reporting import figures, tables
-from curation_ros.reporting.blocks import Block, Figure, Points, Table, Text
-from curation_ros.reporting.findings import Row, groups
-from curation_ros.reporting.salvaged import salvage_figure
-from curation_ros.study.plan import DECIDED, parse_row
+from curation_ros.core.types import JsonObject
+from curation_ros.reporting import panels
+from curation_ros.reporting.blocks import Block, Figure, Points, Table, Text, missing
+from curation_ros.reporting.cells import NOTHING, tally
+from curation_ros.reporting.drawing import figure
+from curation_ros.reporting.plotting import file_name
+from curation_ros.reporting.rows import groups
+from curation_ros.reporting.salvage_picture import salvage_figure
+from curation_ros.reporting.tables import rows_table, stage_caption
+from curation_ros.study.terms import DECIDED, parse_row
 
 _PREFIX = "decided+salvaged-"
 
 
-def salvage_blocks(found: Row) -> tuple[Block, ...]:
-    """What a report says of it; nothing where a study has no such row."""
-    rows = [row for stage in found["stages"] for row in stage["rows"]]
+def salvage_blocks(results: JsonObject) -> tuple[Block, ...]:
+    """The section; empty if no row of the study rests on decisions of the curator."""
+    rows = [row for stage in results["stages"] for row in stage["rows"]]
     if not any(term.name in DECIDED for row in rows for term in parse_row(row["row"])):
         return ()
-    return tuple(_blocks(found))
+    return tuple(_blocks(results))
 
 
-def _blocks(found: Row) -> Iterator[Block]:
+def _blocks(results: JsonObject) -> Iterator[Block]:
     yield Text(
         "The curator decides with its defaults and without a reference: the first evidence that "
         "can tell. What it keeps is trained on whole (decided), of what it saw break the good "
         "beginning (salvaged), and as a control the same episodes cut anywhere (random_cut). "
         "Labels are used to count, here, and nowhere else."
     )
-    yield _verdicts(found)
-    yield from _margins(found)
-    yield from _phases(found)
-    example = found.get("salvaged_example")
+    yield _verdicts(results)
+    yield from _margins(results)
+    yield from _phases(results)
+    example = results.get("salvaged_example")
     if example is not None:
         yield _picture(example)
     else:
-        yield Text("Missing: an episode that was salvaged, to be shown.", is_warning=True)
+        yield missing("an episode that was salvaged, to be shown.")
 
 
-def _verdicts(found: Row) -> Table:
+def _verdicts(results: JsonObject) -> Table:
     rows = []
-    for name, pool in found["pools"].items():
+    for name, pool in results["pools"].items():
         facts = pool.get("curator")
         if facts is None:
             continue
@@ -61,10 +66,8 @@ def _verdicts(found: Row) -> Table:
                     f"{counts[v]['good']} good, {counts[v]['defective']} defective"
                     for v in VERDICTS
                 ),
-                tables.counted(facts["decided_by"]),
-                f"{late['min']:g} / {late['median']:g} / {late['max']:g}"
-                if late
-                else tables.NOTHING,
+                tally(facts["decided_by"]),
+                f"{late['min']:g} / {late['median']:g} / {late['max']:g}" if late else NOTHING,
                 str(late["n"]) if late else "0",
             )
         )
@@ -81,14 +84,14 @@ def _verdicts(found: Row) -> Table:
 # --- margins --------------------------------------------------------------------------------
 
 
-def _margin(row: Row) -> int | None:
-    """Control steps of a row of the sweep; None of another row."""
+def _margin(row: JsonObject) -> int | None:
+    """Margin of a row of the sweep in control steps; None for any other row."""
     name = str(row["row"])
     return int(name.removeprefix(_PREFIX)) if name.startswith(_PREFIX) else None
 
 
-def _margins(found: Row) -> Iterator[Block]:
-    for stage in found["stages"]:
+def _margins(results: JsonObject) -> Iterator[Block]:
+    for stage in results["stages"]:
         swept = [
             (pool, variant, rows)
             for pool, variant, rows in groups(stage)
@@ -97,37 +100,26 @@ def _margins(found: Row) -> Iterator[Block]:
         if not swept:
             continue
         yield _sweep(stage, swept)
-        cells = []
-        for pool, variant, rows in swept:
-            for row in rows:
-                margin = _margin(row)
-                cells.append(
-                    (
-                        row["row"],
-                        f"{pool}, {variant}",
-                        tables.NOTHING if margin is None else str(margin),
-                        tables.good_of(row),
-                        tables.percent(row["rate"]),
-                        tables.percent_span(row["interval"]),
-                        tables.counts(row),
-                    )
-                )
-        yield Table(
-            f"Stage {stage['name']} ({stage['kind']}): how far before the break a beginning ends, "
-            "control steps.",
+        yield rows_table(
+            f"{stage_caption(stage)}: how far before the break a beginning ends, control steps.",
             ("row", "where", "margin", "good", "success", "interval", "seeds"),
-            tuple(cells),
-            text=(0, 1),
+            [row for _, _, rows in swept for row in rows],
+            {"margin": _margin_text},
         )
 
 
-def _sweep(stage: Row, swept: Sequence[tuple[str, str, Sequence[Row]]]) -> Figure:
-    return figures.figure(
-        f"figure-margins-{figures.safe(stage['name'])}",
-        f"Stage {stage['name']} ({stage['kind']}): success against the margin. Bars: 95 % "
+def _margin_text(row: JsonObject) -> str:
+    margin = _margin(row)
+    return NOTHING if margin is None else str(margin)
+
+
+def _sweep(stage: JsonObject, swept: Sequence[tuple[str, str, Sequence[JsonObject]]]) -> Figure:
+    return figure(
+        f"figure-margins-{file_name(stage['name'])}",
+        f"{stage_caption(stage)}: success against the margin. Bars: 95 % "
         "intervals over training seeds and starts; lines across: rows that have no margin.",
         [
-            figures.margin_panel(
+            panels.margin_panel(
                 stage,
                 pool,
                 variant,
@@ -142,19 +134,19 @@ def _sweep(stage: Row, swept: Sequence[tuple[str, str, Sequence[Row]]]) -> Figur
 # --- phases ---------------------------------------------------------------------------------
 
 
-def _phases(found: Row) -> Iterator[Block]:
-    alike: dict[tuple[str, str], list[Row]] = {}
-    for stage in found["stages"]:
+def _phases(results: JsonObject) -> Iterator[Block]:
+    alike: dict[tuple[str, str], list[JsonObject]] = {}
+    for stage in results["stages"]:
         for row in stage["rows"]:
             if row.get("phases"):
                 alike.setdefault((row["pool"], row["set"]), []).append(row)
-    # Equal sets are one line, under all of their names.
+    # Equal sets share a line, which has all of their names.
     known = {
         ", ".join(dict.fromkeys(row["row"] for row in rows)) + f" of {pool}": rows[0]
         for (pool, _), rows in alike.items()
     }
     if not known:
-        yield Text("Missing: the phases that the training sets show.", is_warning=True)
+        yield missing("the phases that the training sets show.")
         return
     names = list(dict.fromkeys(name for row in known.values() for name in row["phases"]))
     yield Table(
@@ -162,41 +154,41 @@ def _phases(found: Row) -> Iterator[Block]:
         ("training set", "n", *(name.lower() for name in names)),
         tuple(
             (
-                title,
+                sets,
                 str(row["n"]),
                 *(_shown(row["phases"].get(name)) for name in names),
             )
-            for title, row in known.items()
+            for sets, row in known.items()
         ),
     )
     few = []
-    for title, row in known.items():
+    for sets, row in known.items():
         rare = [
             f"{name} by {shown['demonstrations']:.3g}"
             for name, shown in row["phases"].items()
             if shown["demonstrations"] < LEAST_SHARE * row["n"]
         ]
         if rare:
-            few.append(f"{title}: of {row['n']} demonstrations, {', '.join(rare)}")
+            few.append(f"{sets}: of {row['n']} demonstrations, {', '.join(rare)}")
     if few:
         yield Text("Phases that less than half of the demonstrations show:", is_warning=True)
         yield Points(tuple(few))
 
 
-def _shown(found: Mapping[str, float] | None) -> str:
-    if found is None:
-        return tables.NOTHING
-    return f"{found['demonstrations']:.3g} ({found['steps']:.0f})"
+def _shown(counts: Mapping[str, float] | None) -> str:
+    if counts is None:
+        return NOTHING
+    return f"{counts['demonstrations']:.3g} ({counts['steps']:.0f})"
 
 
 # --- the picture ----------------------------------------------------------------------------
 
 
 def _picture(example: Mapping[str, Any]) -> Figure:
-    """One salvaged episode, drawn from what the results hold of it.
+    """Draw a salvaged episode from the data of it in the results.
 
     Raises:
-        ConfigError: if they do not hold one.
+        ConfigError: if these data are no episode with a decision.
     """
     try:
         decision = Decision.from_json(example["decision"])

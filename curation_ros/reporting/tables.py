@@ -1,125 +1,124 @@
-"""Tables of a report: the figures of `results.json`, written for people."""
+"""The tables of a report."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import Any, TypeAlias
 
+from curation_ros.core.types import JsonObject
 from curation_ros.reporting import published
 from curation_ros.reporting.blocks import Table
-from curation_ros.reporting.findings import Row, at_keep, groups, is_plain, main_keep, named
+from curation_ros.reporting.cells import (
+    NOTHING,
+    good_in,
+    interval,
+    modes,
+    names,
+    number,
+    percent,
+    percent_interval,
+    place,
+    points,
+    probability,
+    rate_with_deviation,
+    rival,
+    seed_successes,
+    tally,
+    unsigned_points,
+    with_interval,
+)
+from curation_ros.reporting.rows import (
+    groups,
+    is_scorer_row,
+    kept_by_scorers,
+    main_keep,
+    row_named,
+)
 
-NOTHING = "-"
 _AGAINST = {
     "auroc": "AUROC, length controlled",
     "auroc_raw": "AUROC, raw",
     "n_good": "good demonstrations kept",
 }
+Column: TypeAlias = Callable[[JsonObject], str]
+#: What tables show of a row: heading -> its text.
+_ROW_COLUMNS: dict[str, Column] = {
+    "row": lambda r: str(r["row"]),
+    "where": place,
+    "needs": lambda r: names(r["needs"]),
+    "n": lambda r: str(r["n"]),
+    "good": good_in,
+    "contamination": lambda r: percent(r["contamination"]),
+    "AUROC": lambda r: number(r["auroc"]),
+    "success": lambda r: percent(r["rate"]),
+    "interval": lambda r: percent_interval(r["interval"]),
+    "sd": lambda r: unsigned_points(r["sd"]),
+    "seeds": seed_successes,
+    "low / middle / high": modes,
+    "rival": rival,
+    "failures reached": lambda r: tally(r["stages_reached"]),
+    "ended by": lambda r: tally(r["ended"]),
+    "tied at cut": lambda r: NOTHING if r["tied_at_cut"] is None else f"{r['tied_at_cut']:g}",
+    "missing": lambda r: str(r["n_missing"]),
+}
+#: What the table of contrasts shows of one that has data: heading -> its text.
+_DIFFERENCE_COLUMNS: dict[str, Column] = {
+    "difference": lambda c: points(c["value"]),
+    "interval": lambda c: percent_interval(c["interval"]),
+    "p": lambda c: probability(c["p"]),
+    "p (Holm)": lambda c: probability(c["p_holm"]),
+    "floor": lambda c: probability(c["p_floor"]),
+    "seeds": lambda c: str(c["n_seeds"]),
+    "starts": lambda c: str(c["n_starts"]),
+    "unpaired": lambda c: str(c["n_unpaired"]),
+    "detectable": lambda c: unsigned_points(c["minimum_detectable"]),
+}
+_LEFT_COLUMNS = {"row", "where", "needs"}
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """Such as `0.804`."""
-    return NOTHING if value is None else f"{value:.{digits}f}"
+def stage_caption(stage: JsonObject) -> str:
+    """Beginning of a caption: name and kind of the stage."""
+    return f"Stage {stage['name']} ({stage['kind']})"
 
 
-def percent(value: float | None) -> str:
-    """Such as `93.3 %`."""
-    return NOTHING if value is None else f"{100 * value:.1f} %"
+def rows_table(
+    caption: str,
+    headings: Sequence[str],
+    rows: Iterable[JsonObject],
+    more: Mapping[str, Column] | None = None,
+) -> Table:
+    """A table of rows.
+
+    Args:
+        caption: what it shows.
+        headings: its columns, in order.
+        rows: rows of a stage.
+        more: columns beyond the usual ones: heading -> text of a row.
+    """
+    columns = {**_ROW_COLUMNS, **(more or {})}
+    return Table(
+        caption,
+        tuple(headings),
+        tuple(tuple(columns[heading](row) for heading in headings) for row in rows),
+        text=tuple(k for k, heading in enumerate(headings) if heading in _LEFT_COLUMNS),
+    )
 
 
-def points(value: float | None) -> str:
-    """A difference of two rates, percentage points."""
-    return NOTHING if value is None else f"{100 * value:+.1f}"
-
-
-def span(bounds: Sequence[float] | None, digits: int = 2) -> str:
-    """An interval of figures."""
-    return NOTHING if bounds is None else f"[{bounds[0]:.{digits}f}, {bounds[1]:.{digits}f}]"
-
-
-def percent_span(bounds: Sequence[float] | None) -> str:
-    """An interval of rates, without the sign of per cent."""
-    return NOTHING if bounds is None else f"[{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]"
-
-
-def probability(p: float | None) -> str:
-    """A p-value; small ones are not written as nought."""
-    if p is None:
-        return NOTHING
-    return "<0.0001" if p < 0.0001 else f"{p:.4f}"
-
-
-def rate_with_deviation(rate: float | None, sd: float | None) -> str:
-    """Such as `63.3 ± 30.7`, in per cent, as the paper prints it."""
-    if rate is None:
-        return NOTHING
-    return f"{100 * rate:.1f} ± {100 * sd:.1f}" if sd is not None else f"{100 * rate:.1f}"
-
-
-def counts(row: Row) -> str:
-    """Successes of each training seed's policy, such as `6, 25, 26 of 30`."""
-    found = row["counts"]
-    if not found:
-        return NOTHING
-    totals = {c["n"] for c in found}
-    if len(totals) == 1:
-        return ", ".join(str(c["successes"]) for c in found) + f" of {totals.pop()}"
-    return ", ".join(f"{c['successes']}/{c['n']}" for c in found)
-
-
-def modes(row: Row) -> str:
-    """How many seeds fail, are in between, work; said where some fail and some work."""
-    found = row["modes"]
-    if found is None:
-        return NOTHING
-    text = f"{found['low']} / {found['middle']} / {found['high']}"
-    return f"{text} bimodal" if found["low"] and found["high"] else text
-
-
-def needs(names: Sequence[str]) -> str:
-    """What somebody must have."""
-    return ", ".join(names)
-
-
-def good_of(row: Row) -> str:
-    """How many of the pool's demonstrations in a set succeeded; those that are there whole."""
-    if not row["n_pool"]:
-        return NOTHING
-    n_good, n_parts = row["n_good"], row.get("n_salvaged", 0)
-    if n_good is None:
-        return NOTHING
-    text = f"{n_good:g} of {row['n_pool'] - n_parts}"
-    return f"{text}, and {n_parts} parts" if n_parts else text
-
-
-def rival(row: Row) -> str:
-    """The best row that needs no more, and how much better than it this one is."""
-    found = row["rival"]
-    if found is None:
-        return NOTHING
-    return f"{found['row']} ({percent(found['rate'])}): {points(found['difference'])}"
-
-
-def counted(found: Mapping[str, int]) -> str:
-    """Such as `LIFT 12, GRASP 3`."""
-    return ", ".join(f"{name} {n}" for name, n in found.items()) or NOTHING
-
-
-def table_1(found: Row, pool: str) -> Table:
-    """AUROC raw and with length controlled, beside the paper's."""
-    facts = found["pools"][pool]
+def table_1(results: JsonObject, pool: str) -> Table:
+    """AUROC raw and with length controlled, next to the paper's Table I."""
+    facts = results["pools"][pool]
     control = facts["length_control"]
-    of = f", T = {control['steps']} steps" if control.get("steps") is not None else ""
+    steps = f", T = {control['steps']} steps" if control.get("steps") is not None else ""
     rows = []
     for row in facts["audit"]:
         paper = row.get("paper") or {}
         rows.append(
             (
                 row["scorer"],
-                needs(facts["needs"].get(row["scorer"], [row["needs"]])),
-                _with_span(row["auroc_raw"], row["ci_raw"]),
+                names(facts["needs"].get(row["scorer"], [row["needs"]])),
+                with_interval(row["auroc_raw"], row["ci_raw"]),
                 number(paper.get("raw")),
-                _with_span(row["auroc_controlled"], row["ci"]),
+                with_interval(row["auroc_controlled"], row["ci"]),
                 number(paper.get("truncated")),
                 number(paper.get("truncated_joined_by_name")),
                 number(row.get("precision")),
@@ -129,7 +128,7 @@ def table_1(found: Row, pool: str) -> Table:
     kept = next((row["keep"] for row in facts["audit"]), None)
     return Table(
         f"Pool {pool}: {facts['n_good']} good of {facts['n']}, {facts['n_starts']} start states; "
-        f"length control {control['mode']}{of} (needs {control['needs']}). Intervals are 95 %. "
+        f"length control {control['mode']}{steps} (needs {control['needs']}). Intervals are 95 %. "
         f"Precision and recall: of the best {kept}.",
         (
             "scorer", "needs", "AUROC raw", "paper raw", "AUROC controlled", "paper T = 324",
@@ -140,43 +139,35 @@ def table_1(found: Row, pool: str) -> Table:
     )  # fmt: skip
 
 
-def _with_span(value: float | None, bounds: Sequence[float] | None) -> str:
-    return NOTHING if value is None else f"{number(value)} {span(bounds)}"
-
-
-def table_2(found: Row, stage: Row, pool: str) -> Table:
-    """Success of all conditions at one number kept, observation variants side by side."""
-    parts = {variant: rows for p, variant, rows in groups(stage) if p == pool}
-    first = next(iter(parts.values()))
-    keep = main_keep(found, pool, first)
-    names = [r["row"] for r in at_keep(first, keep)]
-    order = [f"{name}@{keep}" for name in published.TABLE_2]
-    names.sort(key=lambda n: order.index(n) if n in order else len(order))
-    names = [*_there(first, "oracle", "reference"), *names, *_there(first, "everything")]
+def table_2(results: JsonObject, stage: JsonObject, pool: str) -> Table:
+    """Success of all conditions at one number kept, next to the paper's Table II."""
+    by_variant = {variant: rows for p, variant, rows in groups(stage) if p == pool}
+    first = next(iter(by_variant.values()))
     headings = [
         *("condition", "needs", "good", "AUROC", "paper AUROC", "paper joined"),
-        *(f"{v}: success" for v in parts),
+        *(f"{v}: success" for v in by_variant),
         "paper success",
-        *(f"{v}: gap closed" for v in parts),
+        *(f"{v}: gap closed" for v in by_variant),
         "paper gap closed",
-        *(f"{v}: {what}" for v in parts for what in ("interval", "seeds")),
+        *(f"{v}: {what}" for v in by_variant for what in ("interval", "seeds")),
     ]
     rows = []
-    for name in names:
-        some = [named(those, name) or {} for those in parts.values()]
+    for name in _conditions(first, main_keep(results, pool, first)):
+        some = [row_named(those, name) or {} for those in by_variant.values()]
         one = next(row for row in some if row)
         paper = published.TABLE_2.get(one["scorer"] or one["row"])
-        cells = [name, needs(one["needs"]), good_of(one), number(one["auroc"])]
+        cells = [name, names(one["needs"]), good_in(one), number(one["auroc"])]
         cells += [number(paper.auroc if paper else None), number(paper.joined if paper else None)]
         cells += [rate_with_deviation(r.get("rate"), r.get("sd_population")) for r in some]
         cells += [rate_with_deviation(paper.success, paper.sd) if paper else NOTHING]
         cells += [percent(r.get("gap_closed")) for r in some]
         cells += [f"{100 * paper.gap_closed:.0f} %" if paper else NOTHING]
         for row in some:
-            cells += [percent_span(row.get("interval")), counts(row) if row else NOTHING]
+            cells += [percent_interval(row.get("interval"))]
+            cells += [seed_successes(row) if row else NOTHING]
         rows.append(tuple(cells))
     return Table(
-        f"Stage {stage['name']} ({stage['kind']}), pool {pool}: success in per cent, mean ± "
+        f"{stage_caption(stage)}, pool {pool}: success in per cent, mean ± "
         "population standard deviation over training seeds (as the paper has it), 95 % interval "
         "over seeds and starts, successes of each seed's policy.",
         tuple(headings),
@@ -185,12 +176,20 @@ def table_2(found: Row, stage: Row, pool: str) -> Table:
     )
 
 
-def _there(rows: Sequence[Row], *names: str) -> list[str]:
-    return [name for name in names if named(rows, name)]
+def _conditions(rows: Sequence[JsonObject], keep: int | None) -> list[str]:
+    """Names of the rows that Table II compares: scorers in the paper's order, and baselines."""
+    scorers = [r["row"] for r in kept_by_scorers(rows, keep)]
+    order = [f"{name}@{keep}" for name in published.TABLE_2]
+    scorers.sort(key=lambda n: order.index(n) if n in order else len(order))
+
+    def present(*baselines: str) -> list[str]:
+        return [name for name in baselines if row_named(rows, name)]
+
+    return [*present("oracle", "reference"), *scorers, *present("everything")]
 
 
 def published_kept() -> Table:
-    """What the paper's policies were trained on, and what they would have been."""
+    """What the paper's policies were trained on, and would have been with rows joined by name."""
     return Table(
         f"The {published.KEEP} demonstrations that the paper's policies were trained on: how many "
         "of the 20 that its files call clean.",
@@ -203,9 +202,17 @@ def published_kept() -> Table:
     )
 
 
-def correlations(stage: Row, keeps: Collection[int | None] = ()) -> Table | None:
-    """Detection against success over the scorers, at these numbers kept or at all."""
-    rows = [
+def correlations(stage: JsonObject, keeps: Collection[int | None] = ()) -> Table | None:
+    """Detection against success over the scorers.
+
+    Args:
+        stage: of the results.
+        keeps: numbers kept to show; all if there are none.
+
+    Returns:
+        The table, or None if there is no correlation to show.
+    """
+    rows: list[tuple[str, ...]] = [
         (
             one["pool"],
             one["variant"],
@@ -213,7 +220,7 @@ def correlations(stage: Row, keeps: Collection[int | None] = ()) -> Table | None
             str(one["keep"]),
             str(one["n"]),
             number(one["rho"], 2),
-            span(one["interval"]),
+            interval(one["interval"]),
             probability(one["p"]),
             {True: "exact", False: "drawn", None: NOTHING}[one["is_exact"]],
         )
@@ -223,20 +230,9 @@ def correlations(stage: Row, keeps: Collection[int | None] = ()) -> Table | None
     if not rows:
         return None
     if stage["kind"] == "protocol":
-        paper = ("the paper", NOTHING, _AGAINST["auroc"], str(published.KEEP), "7")
-        low, high = published.RHO_INTERVAL
-        rows += [
-            (*paper, number(published.RHO_PRINTED, 2), NOTHING, NOTHING, "as printed"),
-            (
-                *paper,
-                number(published.RHO, 2),
-                span((low, high)),
-                number(published.RHO_P, 2),
-                "from its Table II",
-            ),
-        ]
+        rows += _published_correlations()
     return Table(
-        f"Stage {stage['name']} ({stage['kind']}): Spearman's rho with success over scorers at "
+        f"{stage_caption(stage)}: Spearman's rho with success over scorers at "
         "one number kept, with its 95 % interval and permutation p.",
         ("pool", "observations", "of", "kept", "scorers", "rho", "interval", "p", "p is"),
         tuple(rows),
@@ -244,143 +240,88 @@ def correlations(stage: Row, keeps: Collection[int | None] = ()) -> Table | None
     )
 
 
-def contrasts(stage: Row) -> Table:
-    """Planned contrasts with all that is to be said of them."""
+def _published_correlations() -> list[tuple[str, ...]]:
+    """The paper's correlation, as printed and as computed from its table."""
+    paper = ("the paper", NOTHING, _AGAINST["auroc"], str(published.KEEP), "7")
+    return [
+        (*paper, number(published.RHO_PRINTED, 2), NOTHING, NOTHING, "as printed"),
+        (
+            *paper,
+            number(published.RHO, 2),
+            interval(published.RHO_INTERVAL),
+            number(published.RHO_P, 2),
+            "from its Table II",
+        ),
+    ]
+
+
+def contrasts(stage: JsonObject) -> Table:
+    """Planned contrasts: differences, intervals, p-values and what would be detectable."""
     rows = []
     for one in stage["contrasts"]:
-        made = "value" in one
-        rows.append(
-            (
-                f"{one['a']} minus {one['b']}",
-                f"{one['pool']}, {one['variant']}",
-                points(one["value"]) if made else "no data",
-                percent_span(one["interval"]) if made else NOTHING,
-                probability(one["p"]) if made else NOTHING,
-                probability(one["p_holm"]),
-                probability(one["p_floor"]) if made else NOTHING,
-                str(one["n_seeds"]) if made else NOTHING,
-                str(one["n_starts"]) if made else NOTHING,
-                str(one["n_unpaired"]) if made else NOTHING,
-                number(_hundred(one["minimum_detectable"]), 1) if made else NOTHING,
-                one["why"] + (" (equal sets)" if one.get("is_same_set") else ""),
-            )
-        )
+        if "value" in one:
+            difference = [cell(one) for cell in _DIFFERENCE_COLUMNS.values()]
+        else:
+            empty = {**dict.fromkeys(_DIFFERENCE_COLUMNS, NOTHING), "difference": "no data"}
+            difference = list(empty.values())
+        why = one["why"] + (" (equal sets)" if one.get("is_same_set") else "")
+        rows.append((f"{one['a']} minus {one['b']}", place(one), *difference, why))
+    headings = ("contrast", "where", *_DIFFERENCE_COLUMNS, "question")
     return Table(
         f"Stage {stage['name']}: planned contrasts, differences in percentage points with 95 % "
         f"intervals; p-values adjusted for all {len(rows)} by Holm's method. The floor is the "
         "smallest p that so many seeds can give; detectable is the smallest difference that "
         "would have been found four times in five.",
-        (
-            "contrast", "where", "difference", "interval", "p", "p (Holm)", "floor", "seeds",
-            "starts", "unpaired", "detectable", "question",
-        ),
+        headings,
         tuple(rows),
-        text=(0, 1, 11),
-    )  # fmt: skip
+        text=(0, 1, len(headings) - 1),
+    )
 
 
-def _hundred(value: float | None) -> float | None:
-    return None if value is None else 100 * value
-
-
-def all_rows(stage: Row) -> Table:
+def all_rows(stage: JsonObject) -> Table:
     """Every training set of a stage with all its counts."""
-    rows = [
-        (
-            row["row"],
-            f"{row['pool']}, {row['variant']}",
-            needs(row["needs"]),
-            str(row["n"]),
-            good_of(row),
-            percent(row["contamination"]),
-            number(row["auroc"]),
-            percent(row["rate"]),
-            percent_span(row["interval"]),
-            number(_hundred(row["sd"]), 1),
-            counts(row),
-            modes(row),
-            rival(row),
-            counted(row["stages_reached"]),
-            counted(row["ended"]),
-            f"{row['tied_at_cut']:g}" if row["tied_at_cut"] is not None else NOTHING,
-            str(row["n_missing"]),
-        )
-        for row in stage["rows"]
-    ]
-    return Table(
-        f"Stage {stage['name']} ({stage['kind']}): every training set. n counts trusted "
+    return rows_table(
+        f"{stage_caption(stage)}: every training set. n counts trusted "
         "demonstrations, too; good and contamination are of those from the pool. sd is the sample "
         "standard deviation over seeds, percentage points. Modes: seeds with at most 20 %, in "
         "between, with at least 80 % success. The rival is the best row without a scorer that "
         "needs no more, and the difference from it in percentage points.",
-        (
-            "row", "where", "needs", "n", "good", "contamination", "AUROC", "success", "interval",
-            "sd", "seeds", "low / middle / high", "rival", "failures reached", "ended by",
-            "tied at cut", "missing",
-        ),
-        tuple(rows),
-        text=(0, 1, 2),
-    )  # fmt: skip
-
-
-def baselines(stage: Row) -> Table:
-    """What costs no scorer: the rows that everyone forgets."""
-    rows = [r for r in stage["rows"] if not r["scorer"] and "@" not in r["row"]]
-    return Table(
-        f"Stage {stage['name']} ({stage['kind']}): what can be had without any scorer.",
-        ("row", "where", "needs", "n", "good", "success", "interval", "seeds"),
-        tuple(
-            (
-                row["row"],
-                f"{row['pool']}, {row['variant']}",
-                needs(row["needs"]),
-                str(row["n"]),
-                good_of(row),
-                percent(row["rate"]),
-                percent_span(row["interval"]),
-                counts(row),
-            )
-            for row in rows
-        ),
-        text=(0, 1, 2),
+        tuple(_ROW_COLUMNS),
+        stage["rows"],
     )
 
 
-def best_cells(stage: Row) -> Table:
-    """The best number kept of each scorer; chosen after looking."""
-    rows = []
-    for pool, variant, some in groups(stage):
-        best: dict[str, Row] = {}
+def baselines(stage: JsonObject) -> Table:
+    """The rows that need no scorer and keep no number."""
+    return rows_table(
+        f"{stage_caption(stage)}: what can be had without any scorer.",
+        ("row", "where", "needs", "n", "good", "success", "interval", "seeds"),
+        [r for r in stage["rows"] if not r["scorer"] and "@" not in r["row"]],
+    )
+
+
+def best_cells(stage: JsonObject) -> Table:
+    """Each scorer at the number kept that did best, which is chosen after looking."""
+    rows: list[JsonObject] = []
+    for _, _, some in groups(stage):
+        best: dict[str, JsonObject] = {}
         for row in some:
-            if is_plain(row) and row["rate"] is not None:
+            if is_scorer_row(row) and row["rate"] is not None:
                 known = best.get(row["scorer"])
                 if known is None or row["rate"] > known["rate"]:
                     best[row["scorer"]] = row
-        rows += [
-            (
-                row["row"],
-                f"{pool}, {variant}",
-                needs(row["needs"]),
-                good_of(row),
-                number(row["auroc"]),
-                percent(row["rate"]),
-                percent_span(row["interval"]),
-                rival(row),
-            )
-            for row in sorted(best.values(), key=lambda r: -r["rate"])
-        ]
-    return Table(
-        f"Stage {stage['name']} ({stage['kind']}): each scorer at the number kept that did best. "
+        rows += sorted(best.values(), key=lambda r: -r["rate"])
+    return rows_table(
+        f"{stage_caption(stage)}: each scorer at the number kept that did best. "
         "Chosen after looking, so these are too good: a look, not a claim.",
         ("row", "where", "needs", "good", "AUROC", "success", "interval", "rival"),
-        tuple(rows),
-        text=(0, 1, 2),
+        rows,
     )
 
 
-def purity(found: Row) -> Table | None:
-    """The most that can be good among so many kept."""
-    ceilings = {name: pool["purity_ceiling"] for name, pool in found["pools"].items()}
+def purity(results: JsonObject) -> Table | None:
+    """The largest possible share of good demonstrations among K kept."""
+    ceilings = {name: pool["purity_ceiling"] for name, pool in results["pools"].items()}
     kept = sorted({int(k) for ceiling in ceilings.values() for k in ceiling})
     if not kept:
         return None
@@ -394,13 +335,13 @@ def purity(found: Row) -> Table | None:
     )
 
 
-def mapping(caption: str, found: Mapping[str, Any]) -> Table:
-    """Keys and values."""
-    return Table(caption, ("", ""), tuple((k, str(v)) for k, v in found.items()), text=(0, 1))
+def mapping(caption: str, values: Mapping[str, Any]) -> Table:
+    """A table of keys and values."""
+    return Table(caption, ("", ""), tuple((k, str(v)) for k, v in values.items()), text=(0, 1))
 
 
-def wall_times(found: Row) -> Table | None:
-    """What took how long, in all runs."""
+def wall_times(results: JsonObject) -> Table | None:
+    """Wall time of each part of each run."""
     rows = [
         (
             str(one.get("what", "")),
@@ -409,7 +350,7 @@ def wall_times(found: Row) -> Table | None:
             str(one.get("steps", NOTHING)),
             number(one.get("seconds"), 1),
         )
-        for one in found["seconds"]
+        for one in results["seconds"]
     ]
     if not rows:
         return None

@@ -14,95 +14,12 @@ import yaml
 
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.scorers import SCORERS
+from curation_ros.study.terms import Term, parse_row
 
 #: What a stage is for. `screen` figures are for looking around: nothing is claimed from them.
 KINDS = ("protocol", "screen", "confirm")
-#: Training sets that no scorer makes: name -> (what it needs, what it is, whether it takes @K).
-CONTROLS: dict[str, tuple[str, str, bool]] = {
-    "everything": ("nothing", "all of the contaminated demonstrations", False),
-    "random": ("nothing", "K drawn at random; #N is the draw, else each seed has its own", True),
-    "oracle": ("labels", "those that succeeded; with @K also defective ones, up to K", True),
-    "worst": ("labels", "K, defective ones first", True),
-    "shuffled": ("labels", "K as the oracle keeps them, by labels that were shuffled", True),
-    "button": (
-        "outcome button",
-        "what a person calls a success, wrong in %P of 100 presses",
-        False,
-    ),
-    "reference": ("reference", "the trusted demonstrations alone", False),
-    "more": ("more clean demonstrations", "K of the dataset `more`", True),
-    "decided": ("object pose", "what the curator keeps whole by default, no reference", False),
-    "salvaged": (
-        "object pose",
-        "good beginnings of what the curator salvages; -M ends them M control steps before",
-        False,
-    ),
-    "random_cut": ("object pose", "the same episodes, each cut at a random step", False),
-}
-#: Terms that are what the curator decides: their needs are those of the scorer that decided.
-DECIDED = ("decided", "salvaged", "random_cut")
-#: Terms whose draw may be named; else each training seed has its own.
-_DRAWN = ("random", "shuffled", "random_cut")
 #: Most contrasts of a stage that confirms.
 MAX_CONTRASTS = 12
-_TERM = re.compile(r"([a-z_]+)(?:-([0-9]+))?(?:@([0-9]+))?(?:#([0-9]+))?(?:%([0-9]+))?")
-
-
-@dataclass(frozen=True)
-class Term:
-    """A part of a training set.
-
-    Attributes:
-        name: a scorer, or one of CONTROLS.
-        keep: how many to keep, best first; None where the set has a size of its own.
-        draw: of `random`, `shuffled` and `random_cut`; None: every training seed has a draw of
-            its own.
-        wrong: of `button`: wrong presses of 100.
-        margin: of `salvaged`: control steps that the beginning ends before the break; None: the
-            curator's own margin.
-    """
-
-    name: str
-    keep: int | None = None
-    draw: int | None = None
-    wrong: int = 0
-    margin: int | None = None
-
-    @property
-    def is_drawn(self) -> bool:
-        """Whether training seeds have sets of their own."""
-        return self.name in _DRAWN and self.draw is None
-
-
-def parse_row(text: str) -> tuple[Term, ...]:
-    """Terms of a training set such as `knn@16`, `random@16#3`, `button%10`, `decided+salvaged-15`.
-
-    Raises:
-        ConfigError: naming what is wrong.
-    """
-    terms = []
-    for part in text.replace(" ", "").split("+"):
-        found = _TERM.fullmatch(part)
-        if not found or (found[1] not in SCORERS and found[1] not in CONTROLS):
-            known = ", ".join((*CONTROLS, *SCORERS))
-            raise ConfigError(f"training set {text!r}: {part!r} is none; known are {known}")
-        name, keep = found[1], int(found[3]) if found[3] else None
-        sized = name in SCORERS or (CONTROLS[name][2] and name != "oracle")
-        if (sized and not keep) or (keep is not None and not (sized or name == "oracle")):
-            raise ConfigError(
-                f"training set {text!r}: {name} "
-                + ("needs a number to keep, as in " + name + "@16" if sized else "takes no @K")
-            )
-        if found[4] is not None and name not in _DRAWN:
-            raise ConfigError(f"training set {text!r}: {name} has no draws")
-        if (found[5] is None) == (name == "button"):
-            raise ConfigError(f"training set {text!r}: %P is for button, as in button%10")
-        if found[2] is not None and name != "salvaged":
-            raise ConfigError(f"training set {text!r}: -M is for salvaged, as in salvaged-15")
-        draw = None if found[4] is None else int(found[4])
-        margin = None if found[2] is None else int(found[2])
-        terms.append(Term(name, keep, draw, int(found[5] or 0), margin))
-    return tuple(terms)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,8 @@ from curation_ros.study.curated import (
     phases_alone,
     phases_shown,
 )
-from curation_ros.study.plan import CONTROLS, DECIDED, StudyPlan, Term, parse_row
+from curation_ros.study.plan import StudyPlan
+from curation_ros.study.terms import CONTROLS, DECIDED, Term, parse_row
 
 if TYPE_CHECKING:
     from curation_ros.study.collect import Collection
@@ -307,7 +308,7 @@ def training_set(
 
     Args:
         pool: whose.
-        row: such as `knn@16`, see `curation_ros.study.plan.parse_row`.
+        row: such as `knn@16`, see `curation_ros.study.terms.parse_row`.
         reference: the trusted demonstrations.
         seed: of equal scores and of the controls.
         draw: of the controls that name none.
@@ -328,7 +329,7 @@ def training_set(
             n_reference = len(trusted)
             bags |= {bag.name: bag for bag in trusted}
         elif term.name == "more":
-            needs.add(CONTROLS["more"][0])
+            needs.add(CONTROLS["more"].needs)
             further = _further(more, term.keep or 0)
             n_more = len(further)
             bags |= {bag.name: bag for bag in further}
@@ -340,7 +341,7 @@ def training_set(
             ids, tied = _kept(pool, term, seed)
             chosen = _united(chosen, dict.fromkeys(ids))
             needs |= set(
-                pool.needs[term.name] if term.name in SCORERS else (CONTROLS[term.name][0],)
+                pool.needs[term.name] if term.name in SCORERS else (CONTROLS[term.name].needs,)
             )
     bags |= {i: pool.dataset.bag_path(i) for i in chosen}
     return TrainingSet(

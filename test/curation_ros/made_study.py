@@ -16,10 +16,11 @@ from curation_ros.core.episode.episode import Episode
 from curation_ros.core.statistics import detection
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.study.curated import curate, facts_of, phases_alone
-from curation_ros.study.plan import DECIDED, StudyPlan, plan_from
+from curation_ros.study.plan import StudyPlan, plan_from
 from curation_ros.study.pools import POINTS_PER_PHASE, Pool, training_set
 from curation_ros.study.results import results
 from curation_ros.study.running import Cell, Study
+from curation_ros.study.terms import DECIDED
 from curation_ros.study.units import Judge
 from sim_node.starts import start_names
 

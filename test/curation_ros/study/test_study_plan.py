@@ -12,7 +12,8 @@ import yaml
 
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.scorers import SCORERS
-from curation_ros.study.plan import Term, parse_row, plan_from, read_plan
+from curation_ros.study.plan import plan_from, read_plan
+from curation_ros.study.terms import parse_row
 
 CONFIG = Path(__file__).parents[3] / "config"
 
@@ -55,43 +56,6 @@ def test_the_paper_protocol_is_that_of_the_paper() -> None:
     assert {t.keep for r in stage.rows for t in parse_row(r)} == {None, 60}
     # Two pools, two variants, and ten conditions: seven metrics, length, everything, oracle.
     assert len(stage.cells()) == 2 * 2 * 10
-
-
-def test_rows_are_read_term_by_term() -> None:
-    assert parse_row("reference + knn@16") == (Term("reference"), Term("knn", 16))
-    assert parse_row("random@16#3") == (Term("random", 16, 3),)
-    assert parse_row("button%10") == (Term("button", wrong=10),)
-    assert parse_row("oracle") == (Term("oracle"),)
-    assert parse_row("random@16")[0].is_drawn
-    assert not parse_row("random@16#0")[0].is_drawn
-    assert parse_row("decided+salvaged-15") == (Term("decided"), Term("salvaged", margin=15))
-    assert parse_row("salvaged-0")[0].margin == 0
-    assert parse_row("salvaged")[0].margin is None
-    assert parse_row("random_cut")[0].is_drawn
-    assert parse_row("oracle+more@16") == (Term("oracle"), Term("more", 16))
-
-
-@pytest.mark.parametrize(
-    ("row", "said"),
-    [
-        ("knn", "knn needs a number to keep"),
-        ("knn@0", "knn needs a number to keep"),
-        ("everything@3", "everything takes no @K"),
-        ("nobody@3", "'nobody@3' is none; known are everything"),
-        ("knn@3#1", "knn has no draws"),
-        ("button", "%P is for button"),
-        ("knn@3%10", "%P is for button"),
-        ("decided-15", "-M is for salvaged"),
-        ("decided@3", "decided takes no @K"),
-        ("salvaged#2", "salvaged has no draws"),
-        ("more", "more needs a number to keep"),
-        ("", "is none"),
-        ("knn@16+", "is none"),
-    ],
-)
-def test_rows_that_make_no_sense_are_named(row: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        parse_row(row)
 
 
 def test_rows_in_braces_are_several() -> None:

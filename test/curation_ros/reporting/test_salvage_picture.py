@@ -19,7 +19,7 @@ from matplotlib.figure import Figure as Canvas
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import Decision
 from curation_ros.core.episode.episode import Episode
-from curation_ros.reporting.salvaged import (
+from curation_ros.reporting.salvage_picture import (
     salvage_drawing,
     salvage_figure,
     save_salvage_figure,
@@ -55,7 +55,7 @@ def without(episode: Episode, *names: str, gripper: bool = True) -> Episode:
     return replace(episode, fields=fields, topic_map=mapped)
 
 
-def words_above(axes: Axes) -> list[str]:
+def texts_above(axes: Axes) -> list[str]:
     return [text.get_text() for text in axes.texts]
 
 
@@ -74,7 +74,7 @@ def test_every_panel_has_the_cut_and_the_break(dropped: Episode, decision: Decis
         assert lines_across(axes) == [cut_s, broke_s]
         [kept] = [p for p in axes.patches if p.get_alpha()]
         assert (kept.get_x(), kept.get_x() + kept.get_width()) == pytest.approx((0.01, cut_s))
-    assert words_above(panels[0]) == [
+    assert texts_above(panels[0]) == [
         f"told to open at {broke_s:.2f} s",
         f"cut: kept until {cut_s:.2f} s",
     ]
@@ -151,11 +151,11 @@ def test_an_object_without_a_single_pose_is_left_out(dropped: Episode, decision:
     assert "bowl" not in labels
 
 
-def test_a_break_that_nobody_commanded_is_called_so(dropped: Episode, decision: Decision) -> None:
+def test_a_break_without_a_command_is_called_a_break(dropped: Episode, decision: Decision) -> None:
     left_ns = decision.evidence["seen"]["object_coupling"]["span"][0]
     cause = {**decision.evidence["salvage"], "broke_ns": left_ns}
     by_itself = replace(decision, evidence={**decision.evidence, "salvage": cause})
-    assert words_above(drawn(dropped, by_itself)[0])[0] == f"broke at {left_ns / 1e9:.2f} s"
+    assert texts_above(drawn(dropped, by_itself)[0])[0] == f"broke at {left_ns / 1e9:.2f} s"
 
 
 def test_a_person_may_keep_a_span_from_the_middle(dropped: Episode) -> None:
@@ -163,13 +163,13 @@ def test_a_person_may_keep_a_span_from_the_middle(dropped: Episode) -> None:
     chosen = Decision(dropped.id, dropped.name, "salvage", "the middle is fine", span, by="ann")
     heights = drawn(dropped, chosen)[0]
     assert lines_across(heights) == [2.0, 6.0]
-    assert words_above(heights) == ["cut: kept until 6.00 s", "kept from 2.00 s"]
+    assert texts_above(heights) == ["cut: kept until 6.00 s", "kept from 2.00 s"]
 
 
 def test_what_is_reviewed_has_no_cut_and_nothing_shaded(dropped: Episode) -> None:
     review = Decision(dropped.id, dropped.name, "review", "no rule", (0, 6_000_000_000))
     heights = drawn(dropped, review)[0]
-    assert (lines_across(heights), words_above(heights), list(heights.patches)) == ([], [], [])
+    assert (lines_across(heights), texts_above(heights), list(heights.patches)) == ([], [], [])
 
 
 def test_files_are_written_with_name_and_reason(

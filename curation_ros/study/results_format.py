@@ -1,19 +1,19 @@
-"""Reads `results.json`, and finds the rows in it that belong together."""
+"""The format of `results.json`: its keys and their types, and how it is read."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
 from curation_ros.core.errors import ConfigError
+from curation_ros.core.types import JsonObject
 from curation_ros.files import named_errors
-from curation_ros.study.plan import parse_row
+from curation_ros.study.terms import parse_row
 
-#: Of `results.json`; see `curation_ros.study.results.FORMAT`, which needs a simulator to import.
+#: Version of the format; it goes up when a key changes its meaning.
 FORMAT = 1
-Row = Mapping[str, Any]
 
 _OPTIONAL = (int, float, type(None))
 _LIST = (list, tuple)
@@ -59,12 +59,12 @@ _CORRELATION = {
 }  # fmt: skip
 
 
-def read_results(path: Path) -> dict[str, Any]:
-    """What a `results.json` holds.
+def read_results(path: Path) -> JsonObject:
+    """Read a `results.json`.
 
     Raises:
-        ConfigError: if it is none, or one of another format.
-        CurationError: if it cannot be read.
+        ConfigError: if the file holds no results of a study, or another format of them.
+        CurationError: if the file cannot be read.
     """
     with named_errors(path):
         raw = path.read_bytes()
@@ -73,17 +73,17 @@ def read_results(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as err:
         raise ConfigError(f"{path}: not JSON: {err}") from err
     try:
-        check(found)
+        check_results(found)
     except ConfigError as err:
         raise ConfigError(f"{path}: {err}") from err
     return dict(found)
 
 
-def check(found: Any) -> None:
-    """Complain about what is no results of a study.
+def check_results(found: Any) -> None:
+    """Check that this is the results of a study.
 
     Raises:
-        ConfigError: naming the key.
+        ConfigError: naming the key that is missing or has the wrong type.
     """
     if not isinstance(found, Mapping) or "format" not in found:
         raise ConfigError("no results of a study: there is no key 'format'")
@@ -122,63 +122,3 @@ def _demand(found: Any, keys: Mapping[str, Any], what: str) -> None:
 
 def _no_constant(text: str) -> NoReturn:
     raise ValueError(f"{text} is no JSON")
-
-
-def groups(stage: Row) -> list[tuple[str, str, list[Row]]]:
-    """(pool, variant, rows) of a stage, in the order of the plan."""
-    found: dict[tuple[str, str], list[Row]] = {}
-    for row in stage["rows"]:
-        found.setdefault((row["pool"], row["variant"]), []).append(row)
-    return [(pool, variant, rows) for (pool, variant), rows in found.items()]
-
-
-def named(rows: Sequence[Row], name: str) -> Row | None:
-    """The row that the plan calls so."""
-    return next((row for row in rows if row["row"] == name), None)
-
-
-def is_plain(row: Row) -> bool:
-    """Whether it is what one scorer keeps, and nothing else."""
-    return bool(row["scorer"]) and "+" not in row["row"]
-
-
-def has_scorers(found: Row) -> bool:
-    """Whether any training set is what a scorer keeps."""
-    return any(row["scorer"] for stage in found["stages"] for row in stage["rows"])
-
-
-def keep_counts(rows: Sequence[Row]) -> list[int]:
-    """How many scorers keep, of these rows."""
-    return sorted({row["keep"] for row in rows if is_plain(row)})
-
-
-def main_keep(found: Row, pool: str, rows: Sequence[Row]) -> int | None:
-    """The number kept that a figure with one point a scorer shows: the audit's, if it is there."""
-    counts = keep_counts(rows)
-    audited = next((row["keep"] for row in found["pools"][pool]["audit"]), None)
-    return audited if audited in counts else (counts[-1] if counts else None)
-
-
-def at_keep(rows: Sequence[Row], keep: int | None) -> list[Row]:
-    """What each scorer keeps of that number."""
-    return [row for row in rows if is_plain(row) and row["keep"] == keep]
-
-
-def draws(rows: Sequence[Row], control: str) -> dict[int, list[Row]]:
-    """Number kept -> rows of a control: one, or one for each draw."""
-    found: dict[int, list[Row]] = {}
-    for row in rows:
-        [first, *more] = parse_row(row["row"])
-        if first.name == control and first.keep is not None and not more:
-            found.setdefault(first.keep, []).append(row)
-    return dict(sorted(found.items()))
-
-
-def is_sweep(rows: Sequence[Row]) -> bool:
-    """Whether there is a curve over the number kept to draw."""
-    return len(keep_counts(rows)) >= 3
-
-
-def stages(found: Row, *kinds: str) -> Iterator[Row]:
-    """Stages of these kinds."""
-    return (stage for stage in found["stages"] if stage["kind"] in kinds)

@@ -1,13 +1,12 @@
-"""Draws one salvaged episode: object height, gripper, phases, what is kept, and where it broke."""
+"""Draws one salvaged episode: heights, gripper, phases, the part that is kept, and the break."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
@@ -17,33 +16,40 @@ from curation_ros.core.evidence.carrying import carrying_of
 from curation_ros.core.evidence.gripper import commanded
 from curation_ros.core.types import NS_PER_S
 from curation_ros.reporting.blocks import Figure
-from curation_ros.reporting.figures import RC, Drawing, figure, spoken
+from curation_ros.reporting.drawing import Drawing, figure, save_png
+from curation_ros.reporting.plotting import BLUE, GREEN, GREY, ORANGE, spoken
 
 if TYPE_CHECKING:
     from curation_ros.core.decision.decision import Decision
     from curation_ros.core.episode.episode import Episode
     from curation_ros.core.types import Floats, Mask
 
-#: Okabe and Ito's, as in the figures of a report.
-_OBJECT, _EFFECTOR, _KEPT, _BROKE = "#0072B2", "#767676", "#009E73", "#D55E00"
+_OBJECT, _EFFECTOR, _KEPT, _BROKE = BLUE, GREY, GREEN, ORANGE
 _WIDTH_IN = 5.4
-#: Heights of the panels, and of title, labels and time axis together, inches.
+#: Heights in inches: of each panel, and of title, labels and time axis together.
 _HEIGHTS_IN, _GRIPPER_IN, _PHASE_IN, _FRAME_IN = 1.7, 0.45, 0.16, 1.5
 _REASON_COLUMNS, _REASON_LINES = 84, 3
-#: 400 pixels wide this is still read; a page shows it at twice that.
+#: At this resolution the text can be read in an image 400 pixels wide.
 _PNG_DPI = 160
-#: Height in inches, and what draws it.
-_Panel = tuple[float, Callable[[Axes], None]]
-#: Time (s), words, colour and dashes.
-_Mark = tuple[float, str, str, str]
+#: Height of a panel in inches, and the function that draws it.
+_Panel: TypeAlias = tuple[float, Callable[[Axes], None]]
+
+
+class _Mark(NamedTuple):
+    """A vertical line at a time, with a text above it."""
+
+    at_s: float
+    text: str
+    color: str
+    dashes: str
 
 
 def salvage_drawing(episode: Episode, decision: Decision) -> Drawing:
-    """The picture of one decision, for a report or a file; panels without data are left out.
+    """The picture of one decision; panels without data are left out.
 
     Args:
-        episode: whole.
-        decision: on it; its span is what is kept.
+        episode: the whole episode.
+        decision: the decision on it. Its span is the part that is kept.
     """
     times_s = (episode.stamps_ns - episode.start_ns) / NS_PER_S
     panels = [
@@ -65,8 +71,10 @@ def salvage_drawing(episode: Episode, decision: Decision) -> Drawing:
             panel(axes)
             if decision.verdict in ("keep", "salvage"):
                 axes.axvspan(*_seconds(decision.span), color=_KEPT, alpha=0.13, lw=0, zorder=0)
-            for at_s, _, color, dashes in marks:
-                axes.axvline(at_s, color=color, linestyle=dashes, linewidth=1.3, zorder=4)
+            for mark in marks:
+                axes.axvline(
+                    mark.at_s, color=mark.color, linestyle=mark.dashes, linewidth=1.3, zorder=4
+                )
         end_s = max((episode.end_ns - episode.start_ns) / NS_PER_S, 1.0 / NS_PER_S)
         grid[-1].set_xlim(0.0, end_s)
         grid[-1].set_xlabel("time from the start, s")
@@ -90,14 +98,15 @@ def salvage_figure(episode: Episode, decision: Decision, name: str = "salvaged")
 def save_salvage_figure(
     episode: Episode, decision: Decision, folder: Path, name: str = "salvaged"
 ) -> tuple[Path, Path]:
-    """Write the picture as <name>.png and <name>.svg; returns both paths."""
+    """Write the picture as <name>.png and <name>.svg.
+
+    Returns:
+        Paths of the PNG and of the SVG file.
+    """
     drawing = salvage_drawing(episode, decision)
     png, svg = folder / f"{name}.png", folder / f"{name}.svg"
     svg.write_text(figure(name, "", [drawing]).whole)
-    with mpl.rc_context(RC):
-        canvas = Canvas(figsize=drawing.size_in, layout="constrained")
-        drawing.draw(canvas)
-        canvas.savefig(png, dpi=_PNG_DPI)
+    save_png(drawing, png, _PNG_DPI)
     return png, svg
 
 
@@ -105,7 +114,7 @@ def save_salvage_figure(
 
 
 def _heights(episode: Episode, times_s: Floats) -> _Panel | None:
-    """Heights of the object that decides and of the effector, from the lowest one shown."""
+    """Heights of the effector and of the object that was carried."""
     effectors = [
         s.name for s in episode.topic_map.with_role("effector") if _has_z(episode, s.name)
     ]
@@ -122,7 +131,7 @@ def _heights(episode: Episode, times_s: Floats) -> _Panel | None:
             axes.plot(times_s, height_m, dashes, color=color, label=label, linewidth=1.6)
         axes.set_ylabel("height, m")
         axes.margins(y=0.1)
-        # Filled: a line across may lie behind it.
+        # An opaque legend hides the vertical lines behind it.
         axes.legend(loc="best", handlelength=1.8, frameon=True, framealpha=1, edgecolor="none")
 
     return _HEIGHTS_IN, draw
@@ -134,11 +143,11 @@ def _has_z(episode: Episode, name: str) -> bool:
 
 
 def _object(episode: Episode) -> str:
-    """The object that was lost, else the one that moved up and down most; empty without any."""
+    """Field of the object that was lost, otherwise of the one that moved most up or down."""
     names = [s.name for s in episode.topic_map.with_role("object") if _has_z(episode, s.name)]
     try:
         worst = carrying_of(episode).worst
-    except EpisodeError:  # neither phases nor a gripper: nobody knows what was grasped
+    except EpisodeError:  # without phases and gripper, the grasped object is unknown
         worst = None
     if worst is not None and worst.object in names:
         return worst.object
@@ -150,12 +159,12 @@ def _range(values: Floats) -> float:
 
 
 def _gripper(episode: Episode, times_s: Floats) -> _Panel | None:
-    """What the gripper was commanded to be."""
+    """The commands to the gripper."""
     try:
         command = commanded(episode).astype(np.float64)
     except EpisodeError:
         return None
-    command[command == 0] = np.nan  # nothing commanded yet
+    command[command == 0] = np.nan  # before the first command
 
     def draw(axes: Axes) -> None:
         axes.step(times_s, command, where="post", color="#333333", linewidth=1.6)
@@ -166,7 +175,7 @@ def _gripper(episode: Episode, times_s: Floats) -> _Panel | None:
 
 
 def _phases(episode: Episode, times_s: Floats) -> _Panel | None:
-    """A row a phase, so that the name of the shortest has room, too."""
+    """One row per phase, so that even the name of a short phase has room."""
     phase = episode.phase
     if phase is None:
         return None
@@ -190,7 +199,7 @@ def _phases(episode: Episode, times_s: Floats) -> _Panel | None:
 
 
 def _runs(mask: Mask, times_s: Floats, period_s: float) -> list[tuple[float, float]]:
-    """Start and duration of every run of steps in which a mask holds, s."""
+    """(start, duration) in seconds of every run of steps in which the mask is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [
         (float(times_s[first]), float(times_s[stop - 1] - times_s[first]) + period_s)
@@ -210,40 +219,40 @@ def _seconds(span: tuple[int, int]) -> tuple[float, float]:
 
 
 def _marks(episode: Episode, decision: Decision) -> list[_Mark]:
-    """The lines across: ends of what is kept, and the break."""
+    """The vertical lines: the ends of the part that is kept, and the break."""
     first_s, last_s = _seconds(decision.span)
     marks: list[_Mark] = []
     if decision.verdict == "salvage":
         if len(episode) and decision.span[0] > episode.span(0, 0)[0]:
-            marks.append((first_s, f"kept from {first_s:.2f} s", _KEPT, "-"))
-        marks.append((last_s, f"cut: kept until {last_s:.2f} s", _KEPT, "-"))
+            marks.append(_Mark(first_s, f"kept from {first_s:.2f} s", _KEPT, "-"))
+        marks.append(_Mark(last_s, f"cut: kept until {last_s:.2f} s", _KEPT, "-"))
     broke_ns = decision.evidence.get("salvage", {}).get("broke_ns")
     if broke_ns is not None:
         at_s = broke_ns / NS_PER_S
-        marks.append((at_s, f"{_what_broke(decision)} at {at_s:.2f} s", _BROKE, "--"))
+        marks.append(_Mark(at_s, f"{_what_broke(decision)} at {at_s:.2f} s", _BROKE, "--"))
     return marks
 
 
 def _what_broke(decision: Decision) -> str:
-    """The break counts from the command to open, where that came first."""
+    """The break is the command to open if that came first, otherwise the loss itself."""
     broke = decision.evidence["salvage"]
     span = decision.evidence.get("seen", {}).get(broke["scorer"], {}).get("span")
     return "told to open" if span and broke["broke_ns"] < span[0] else "broke"
 
 
 def _name_marks(axes: Axes, marks: Sequence[_Mark], end_s: float) -> None:
-    """Words above the panels, a line each: two marks may be as near as they like."""
-    for row, (at_s, words, color, _) in enumerate(reversed(marks)):
-        to_the_right = at_s < 0.5 * end_s
+    """Write the text of each mark on a line of its own, so that near marks do not overlap."""
+    for row, mark in enumerate(reversed(marks)):
+        to_the_right = mark.at_s < 0.5 * end_s
         axes.annotate(
-            words,
-            (at_s, 1.0),
+            mark.text,
+            (mark.at_s, 1.0),
             xycoords=("data", "axes fraction"),
             xytext=(2 if to_the_right else -2, 3 + 11 * row),
             textcoords="offset points",
             ha="left" if to_the_right else "right",
             fontsize=8,
-            color=color,
+            color=mark.color,
             annotation_clip=False,
         )
 
