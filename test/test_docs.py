@@ -32,7 +32,8 @@ pages = pytest.mark.parametrize("page", PAGES, ids=_ID.get)
 def code_of(text: str) -> list[str]:
     """Lines of code blocks, one that goes on as one line, and code spans."""
     blocks = "".join(block for _, block in _FENCE.findall(text)).replace("\\\n", " ")
-    return blocks.splitlines() + re.findall(r"`([^`\n]+)`", _FENCE.sub("", text))
+    spans = re.findall(r"`([^`]+)`", _FENCE.sub("", text))
+    return blocks.splitlines() + [" ".join(span.split()) for span in spans]
 
 
 def calls_of(text: str) -> Iterator[tuple[str, str]]:
