@@ -11,7 +11,7 @@ import yaml
 
 from curation_ros.bags.reader import find_bags, read_episode
 from curation_ros.core.decision.curation import Curation
-from curation_ros.core.decision.rules import RULES, NoRule
+from curation_ros.core.decision.rules import RULES, Rule
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap, read_topic_map
 from curation_ros.core.errors import ConfigError
@@ -76,7 +76,7 @@ def read_curation(config: Path | None, overrides: Mapping[str, Any]) -> Curation
         names = list(settings.get("scorers", _DEFAULTS["scorers"].default))
         if settings.get("rule") == "none" and "rule_scorer" not in given:
             settings["rule_scorer"] = names[0]  # nothing decides
-        rule = RULES.get(settings.get("rule", _DEFAULTS["rule"].default), NoRule)
+        rule = RULES.get(settings.get("rule", _DEFAULTS["rule"].default), Rule)
         decides = settings.get("rule_scorer", _DEFAULTS["rule_scorer"].default)
         asked = [*rule.consults, decides]
         settings["scorers"] = [*names, *(n for n in asked if n not in names)]

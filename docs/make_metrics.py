@@ -15,8 +15,7 @@ import sys
 from pathlib import Path
 from typing import get_args
 
-from curation_ros.core.decision.rules import RULES
-from curation_ros.core.decision.selection import KEEP_RULES
+from curation_ros.core.decision.rules import RULES, make_rule
 from curation_ros.core.episode.findings import FINDINGS
 from curation_ros.core.evidence.length_control import MODES
 from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, Need, PoolScorer, Scorer
@@ -294,16 +293,14 @@ def overview() -> str:
 
 def rule_text(name: str) -> str:
     """The section of one rule."""
-    kind = RULES[name]
-    parameters = [
-        f"`{p.name}` ({p.default})"
-        for p in inspect.signature(kind).parameters.values()
-        if p.name != "scorer"
-    ]
-    facts = [f"- **Needs**: {kind(scorer='').needs}"]
+    rule = make_rule(name, "")
+    parameters = [f"`{k}` ({v})" for k, v in rule.params().items() if k != "scorer"]
+    commands = {"`curation score`": rule.decides, "`curation select`": rule.selects}
+    used = [command for command, can in commands.items() if can]
+    facts = [f"- **Needs**: {rule.needs}", f"- **Used by**: {' and '.join(used)}"]
     if parameters:
         facts.append(f"- **Parameters**: {', '.join(parameters)}")
-    return "\n\n".join([f"### Rule {name}", prose(kind.__doc__ or ""), "\n".join(facts)])
+    return "\n\n".join([f"### Rule {name}", prose(type(rule).__doc__ or ""), "\n".join(facts)])
 
 
 def text(audit: str) -> str:
@@ -334,10 +331,12 @@ def text(audit: str) -> str:
             ("id", "kind", "meaning"),
             [(f"`{k}`", kinds[kind], meaning) for k, (kind, meaning) in FINDINGS.items()],
         ),
-        "## Rules: from scores to verdicts",
+        "## Rules: from scores to verdicts and selections",
+        "`curation score --rule` decides on every episode, `curation select --rule` chooses among "
+        "decided ones. A rule that both can use gives both the same answer for the same scored "
+        "episodes.",
+        table(("rule", "what it does"), [(f"`{k}`", v.summary) for k, v in RULES.items()]),
         *(rule_text(name) for name in RULES),
-        "## Keep rules: from verdicts and scores to a selection",
-        table(("rule", "what it does"), [(f"`{k}`", v) for k, v in KEEP_RULES.items()]),
         "## Audit",
         AUDIT_BEGINS + audit + AUDIT_ENDS,
     ]

@@ -9,7 +9,6 @@ from types import ModuleType
 import pytest
 
 from curation_ros.core.decision.rules import RULES
-from curation_ros.core.decision.selection import KEEP_RULES
 from curation_ros.core.episode.findings import FINDINGS
 from curation_ros.core.evidence.length_control import MODES
 from curation_ros.core.scorers import SCORERS
@@ -42,7 +41,7 @@ def test_document_has_every_scorer_parameter_mode_finding_and_rule(generator: Mo
         for parameter in kind().params():
             assert f"| `{parameter}` |" in section, (name, parameter)
         assert "µs an episode of 350 steps" in section
-    for name in (*MODES, *FINDINGS, *KEEP_RULES):
+    for name in (*MODES, *FINDINGS, *RULES):
         assert f"| `{name}` |" in document, name
     for name in RULES:
         assert f"### Rule {name}\n" in document, name

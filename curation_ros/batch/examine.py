@@ -20,7 +20,7 @@ from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import Decision, untrustworthy
 from curation_ros.core.decision.examination import Examination
 from curation_ros.core.decision.judgement import Ruling
-from curation_ros.core.decision.selection import TieKey
+from curation_ros.core.decision.ties import TieKey
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.episode.topic_map import TopicMap

@@ -31,6 +31,28 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_rule(parser: argparse.ArgumentParser, default: str) -> None:
+    """`--rule`, `--value` and `--method`: what decides or selects.
+
+    Args:
+        parser: of a command.
+        default: which rule the command uses if none is named.
+    """
+    # Importing the rules takes 0.2 s, which commands without rules do not wait for.
+    from curation_ros.core.decision.groups import METHODS
+    from curation_ros.core.decision.rules import RULES
+
+    rules = "; ".join(f"{name}: {rule.summary}" for name, rule in RULES.items())
+    parser.add_argument(
+        "--rule", choices=tuple(RULES), default="", help=f"default: {default}; {rules}"
+    )
+    parser.add_argument("--value", type=float, help="threshold, share or number of the --rule")
+    methods = "; ".join(f"{name}: {text}" for name, text in METHODS.items())
+    parser.add_argument(
+        "--method", choices=tuple(METHODS), default="", help=f"of --rule gap; {methods}"
+    )
+
+
 def add_workers(parser: argparse.ArgumentParser) -> None:
     """`--jobs` and `--backend`: over how many workers, of which kind, work is spread."""
     parser.add_argument(

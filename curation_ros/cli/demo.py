@@ -30,7 +30,7 @@ from scipy.stats import fisher_exact
 
 from curation_ros.bags.reader import read_episode
 from curation_ros.cli.output import VERDICT_STYLE, console, percent, print_json
-from curation_ros.core.decision.selection import Manifest
+from curation_ros.core.decision.manifest import Manifest
 from curation_ros.core.episode.status import EpisodeEvent, Status
 from curation_ros.core.errors import CurationError
 from curation_ros.core.types import NS_PER_S

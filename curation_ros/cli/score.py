@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import inspect
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -17,14 +16,14 @@ from rich.text import Text
 
 from curation_ros.bags.reader import find_bags
 from curation_ros.batch.examine import EpisodesOf, Examined, Examiner, judge_bags
-from curation_ros.cli.arguments import add_config, add_reference, add_workers
+from curation_ros.cli.arguments import add_config, add_reference, add_rule, add_workers
 from curation_ros.cli.output import VERDICT_STYLE, console, print_json, progress_console, warn
 from curation_ros.configuration import read_curation, read_reference, share_file
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import CURATOR, VERDICTS, Decision, in_force
 from curation_ros.core.decision.examination import Examination
-from curation_ros.core.decision.rules import RULES, NoRule
-from curation_ros.core.decision.selection import TieKey
+from curation_ros.core.decision.rules import given_params
+from curation_ros.core.decision.ties import TieKey
 from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.scorers import SCORERS
@@ -49,11 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scorers",
         help=f"comma separated, beside the one that decides: {', '.join(SCORERS)}",
     )
-    parser.add_argument(
-        "--rule", help=f"decision rule, where not that of the config: {', '.join(RULES)}"
-    )
-    parser.add_argument("--rule-scorer", help="the scorer that decides, likewise")
-    parser.add_argument("--value", type=float, help="of --rule: a threshold, share or number")
+    add_rule(parser, default="that of the config")
+    parser.add_argument("--rule-scorer", help="the scorer that decides; default: of the config")
     add_config(parser)
     parser.add_argument(
         "--write", action="store_true", help="log the decisions in the dataset (one PATH)"
@@ -197,12 +193,10 @@ def _curation(args: argparse.Namespace) -> Curation:
         "rule": args.rule,
         "rule_scorer": args.rule_scorer,
     }
-    if args.value is not None:
-        if args.rule is None:
-            raise ConfigError(f"--value {args.value:g} belongs to a --rule: name one")
-        rule = RULES.get(args.rule, NoRule)  # an unknown one is refused where all else is
-        takes_threshold = "threshold" in inspect.signature(rule).parameters
-        settings["rule_params"] = {"threshold" if takes_threshold else "value": args.value}
+    if args.rule:
+        settings["rule_params"] = given_params(args.rule, args.value, args.method)
+    elif args.value is not None or args.method:
+        raise ConfigError("--value and --method belong to a --rule: name one")
     return read_curation(config, settings)
 
 

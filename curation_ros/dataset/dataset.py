@@ -19,7 +19,8 @@ from typing import Any
 
 from curation_ros.bags.reader import Bag, episode_of, hint_of_datasets, open_bag
 from curation_ros.core.decision.decision import Decision, in_force
-from curation_ros.core.decision.selection import Manifest, TieKey, tie_key
+from curation_ros.core.decision.manifest import Manifest
+from curation_ros.core.decision.ties import TieKey, tie_key
 from curation_ros.core.episode.identity import resolve_prefix
 from curation_ros.core.errors import BagError, CurationError, EpisodeError
 from curation_ros.dataset.index import TABLES, Index, SpoiltIndexError

@@ -13,7 +13,7 @@ from typing import Any
 
 from curation_ros.bags.reader import open_bag
 from curation_ros.core.decision.decision import CURATOR, Decision, in_force
-from curation_ros.core.decision.selection import Entry, Manifest
+from curation_ros.core.decision.manifest import Entry, Manifest
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.scorers import SCORERS
 from curation_ros.core.types import NS_PER_S, Span

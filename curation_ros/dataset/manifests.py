@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 
 from curation_ros.bags.reader import episode_of, open_bag, read_episode
 from curation_ros.core.decision.balance import Balance, balance_of, phase_steps
-from curation_ros.core.decision.decision import CURATOR, Decision, in_force
-from curation_ros.core.decision.selection import Candidate, Entry, Manifest, select
+from curation_ros.core.decision.decision import CURATOR, Decision, in_force, untrustworthy
+from curation_ros.core.decision.manifest import Entry, Manifest
+from curation_ros.core.decision.rules import given_params, make_rule
+from curation_ros.core.decision.selection import Candidate, check_selects, select
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import ConfigError, CurationError
@@ -24,6 +26,7 @@ def save_selection(
     *,
     rule: str = "",
     value: float | None = None,
+    method: str = "",
     scorer: str = "",
     name: str = "",
     seed: int = 0,
@@ -31,51 +34,47 @@ def save_selection(
     """Select over all bags of a dataset and write the manifest.
 
     Args:
-        dataset: its bags are the candidates, its decision logs have scores and verdicts.
-        rule: one of KEEP_RULES; empty: `gap` where a scorer is named, else `decisions`.
-        value: what the rule takes.
-        scorer: whose scores rank, for the rules that rank.
+        dataset: its bags are the candidates; its decision logs hold scores and verdicts.
+        rule: one of RULES; empty: `gap` if a scorer is named, else `decisions`.
+        value: the threshold, share or number of the rule; None: its default.
+        method: how `gap` separates groups; empty: its default.
+        scorer: ranks the episodes, for rules that read scores.
         name: of the manifest; empty makes one of rule and time.
-        seed: of the ties.
+        seed: of the order of equal scores.
+
+    Returns:
+        The manifest, and the file that it was written to.
 
     Raises:
-        ConfigError: if the rule and its value do not fit, or it ranks and no scorer is named.
-        CurationError: if there is no bag, the name is taken, or the scores do not separate.
+        ConfigError: if the rule cannot select, its parameters make no sense, or it reads scores
+            and no scorer is named.
+        CurationError: if there is no bag, the name is taken, or the rule has no basis.
     """
     rule = rule or ("gap" if scorer else "decisions")
-    ranks = rule not in ("decisions", "all")
-    if scorer and not ranks:
-        raise ConfigError(f"keep rule {rule!r} ranks nothing: --scorer {scorer} needs a --rule")
-    if ranks and not scorer:
-        raise ConfigError(f"keep rule {rule!r} ranks by a scorer: name one")
+    ruler = make_rule(rule, scorer, given_params(rule, value, method))
+    check_selects(ruler)
+    if scorer and not ruler.reads_scores:
+        raise ConfigError(f"rule {rule!r} reads no scores: --scorer {scorer} needs another --rule")
+    if ruler.reads_scores and not scorer:
+        raise ConfigError(f"rule {rule!r} reads the scores of a scorer: name one with --scorer")
     bags = list(dataset.bags())
     if not bags:
         raise ConfigError(f"dataset {dataset.path}: no episode to select from")
-    names = dict(dataset.names())
     decided = dataset.latest_decisions()
-    scored = {bag.name: _scored(dataset, bag.name) for bag in bags} if ranks else {}
+    scored = {bag.name: _scored(dataset, bag.name) for bag in bags} if ruler.reads_scores else {}
+    if ruler.reads_scores:
+        _check_scored(dataset, scorer, scored)
+    names = dict(dataset.names())
     candidates = [
-        Candidate(
-            bag.name,
-            names.get(bag.name, ""),
-            _score(scored.get(bag.name), scorer),
-            decided.get(bag.name),
-        )
+        _candidate(bag.name, names, scorer, decided.get(bag.name), scored.get(bag.name))
         for bag in bags
     ]
-    if ranks and all(c.score is None for c in candidates):
-        is_fitted = scorer in SCORERS and SCORERS[scorer].needs == "reference"
-        raise ConfigError(
-            f"dataset {dataset.path}: no episode has a logged score of {scorer!r}: run "
-            f"curation score {dataset.path} --write --scorers {scorer}"
-            + (" --reference DATASET" if is_fitted else "")
-        )
     resolution = SCORERS[scorer]().resolution if scorer in SCORERS else 0.0
-    chosen = select(
-        candidates, rule, value, seed=seed, tie=dataset.tie(seed), resolution=resolution
-    )
+    chosen = select(candidates, ruler, seed=seed, tie=dataset.tie(seed), resolution=resolution)
     now = datetime.now(timezone.utc)
-    hashes = {d.state_hash for d in (scored if ranks else decided).values() if d is not None}
+    basis = scored if ruler.reads_scores else decided
+    hashes = {d.state_hash for d in basis.values() if d is not None}
+    used = ruler.params().get(ruler.value_param) if ruler.value_param else None
     manifest = Manifest(
         name=name or f"{rule}-{now:%Y%m%dT%H%M%S%f}",
         created_at=now.isoformat(timespec="seconds"),
@@ -84,7 +83,7 @@ def save_selection(
         rule=rule,
         entries=chosen.entries,
         kept_of=chosen.kept_of,
-        rule_params={"value": value, "seed": seed},
+        rule_params={"value": used, "seed": seed, **({"method": method} if method else {})},
         state_hash=",".join(sorted(hashes)),
         abstained=chosen.abstained,
         phases=phases_of(dataset, chosen.entries),
@@ -92,11 +91,49 @@ def save_selection(
     return manifest, dataset.save_manifest(manifest)
 
 
+def _scored(dataset: Dataset, episode_id: str) -> Decision | None:
+    """The curator's last decision: its scores count, whatever a person decided."""
+    own = in_force(d for d in dataset.decisions(episode_id) if d.by == CURATOR)
+    return own.get(episode_id)
+
+
+def _check_scored(dataset: Dataset, scorer: str, scored: Mapping[str, Decision | None]) -> None:
+    """Refuse a scorer that no logged decision asked.
+
+    Raises:
+        ConfigError: with the command that logs them.
+    """
+    if any(d is not None and scorer in d.scores for d in scored.values()):
+        return
+    is_fitted = scorer in SCORERS and SCORERS[scorer].needs == "reference"
+    raise ConfigError(
+        f"dataset {dataset.path}: no episode has a logged score of {scorer!r}: run "
+        f"curation score {dataset.path} --write --scorers {scorer}"
+        + (" --reference DATASET" if is_fitted else "")
+    )
+
+
+def _candidate(
+    episode_id: str,
+    names: Mapping[str, str],
+    scorer: str,
+    decided: Decision | None,
+    scored: Decision | None,
+) -> Candidate:
+    return Candidate(
+        episode=episode_id,
+        name=names.get(episode_id, ""),
+        score=scored.scores.get(scorer) if scored is not None else None,
+        decision=decided,
+        is_trusted=scored is None or not untrustworthy(scored.findings),
+    )
+
+
 def phases_of(dataset: Dataset, entries: Iterable[Entry]) -> Balance:
     """How much of each phase the entries of a selection show.
 
-    Of each bag only clock and phase are read: 5 ms, of which opening it is nearly half. Of one
-    that cannot be read, or has no phases, they are not known.
+    Of each bag only clock and phase are read, which takes 5 ms. The phases of a bag that cannot be
+    read, or has none, are unknown.
     """
     return balance_of((e.episode, _phase_steps(dataset, e.episode, e.span)) for e in entries)
 
@@ -111,29 +148,19 @@ def _phase_steps(dataset: Dataset, episode_id: str, span: Span | None) -> dict[s
         return phase_steps(
             episode_of(bag, topic_map.only([topic_map.clock, phases[0].name])), span
         )
-    except CurationError:  # who reads it to train on it is told
+    except CurationError:  # training reads the whole bag, and reports it
         return None
-
-
-def _scored(dataset: Dataset, episode_id: str) -> Decision | None:
-    """The curator's last decision: the one whose scores count, whatever a person decided."""
-    own = in_force(d for d in dataset.decisions(episode_id) if d.by == CURATOR)
-    return own.get(episode_id)
-
-
-def _score(decision: Decision | None, scorer: str) -> float | None:
-    return decision.scores.get(scorer) if decision is not None else None
 
 
 def read_manifest(path: Path) -> tuple[Manifest, Dataset]:
     """Read a selection and the dataset that it is part of.
 
     Args:
-        path: `<dataset>/selections/<name>.json`; the dataset is found from there, so that it may
-            be moved as a whole.
+        path: `<dataset>/selections/<name>.json`. The dataset is found from there, so that both
+            may be moved together.
 
     Raises:
-        ConfigError: if it cannot be read or is none.
+        ConfigError: if the file cannot be read, or is not a selection.
         CurationError: if it does not lie in a dataset.
     """
     try:

@@ -16,7 +16,7 @@ import numpy as np
 
 from curation_ros.batch.audit import AuditSettings, audit, read_episodes, read_labels
 from curation_ros.core.decision.curation import Curation
-from curation_ros.core.decision.selection import ranking, tie_key
+from curation_ros.core.decision.ties import ranking, tie_key
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError, EpisodeError
 from curation_ros.core.scorers import SCORERS

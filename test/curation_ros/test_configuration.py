@@ -150,7 +150,7 @@ def test_parameters_of_the_file_s_rule_are_not_those_of_another(tmp_path: Path) 
         ({"salvage_margin_s": "long"}, "expected a number of seconds, or null"),
         ({"salvage_margin_s": -1}, "salvage_margin_s is -1"),
         ({"salvage_margin_s": float("nan")}, "salvage_margin_s is nan"),
-        ({"rule_params": {"threshold": float("nan")}}, "not finite"),
+        ({"rule_params": {"threshold": float("nan")}}, "expected a finite number"),
     ],
 )
 def test_config_that_makes_no_sense_is_refused_by_file(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -12,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from curation_ros.core.decision.decision import CURATOR, Decision, untrustworthy
 from curation_ros.core.decision.examination import Break, Examination, Part
 from curation_ros.core.decision.judgement import Ruling, decide
-from curation_ros.core.decision.rules import RULES, Rule
+from curation_ros.core.decision.rules import Rule, make_rule
 from curation_ros.core.decision.salvage import DEFAULT_MARGIN_S, good_prefix, sound_part
-from curation_ros.core.decision.selection import TieKey
 from curation_ros.core.decision.state_hash import state_hash
+from curation_ros.core.decision.ties import TieKey
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
 from curation_ros.core.evidence.checks import Baseline, check_episode
@@ -39,6 +38,9 @@ _SHOWN = 3
 _STATE_VERSION = 5
 #: References are scored by scorers that were fitted without them; above this many, in groups.
 _MAX_FOLDS = 20
+#: While a dataset grows, a rule over it waits for so many scored episodes: the best of two may be
+#: bad, and the share that was asked for is of a dataset that is not there yet.
+_MIN_PROVISIONAL = 4
 
 
 class Curation:
@@ -109,8 +111,6 @@ class Curation:
                 raise ConfigError(
                     f"parameters for scorer {name!r}, which is none of {', '.join(self.scorers)}"
                 )
-        if rule not in RULES:
-            raise ConfigError(f"no rule {rule!r}; there are {', '.join(RULES)}")
         if rule_scorer not in self.scorers:
             raise ConfigError(
                 f"rule_scorer {rule_scorer!r} is none of the scorers {', '.join(self.scorers)}"
@@ -138,18 +138,10 @@ class Curation:
         return scorer
 
     def _make_rule(self) -> Rule:
-        rule = RULES[self.rule]
-        known = [n for n in inspect.signature(rule).parameters if n != "scorer"]
-        for key in self.rule_params:
-            if key not in known:
-                raise ConfigError(
-                    f"rule {self.rule!r} has no parameter {key!r}; it has "
-                    f"{', '.join(known) or 'none'}"
-                )
-        try:
-            return rule(scorer=self.rule_scorer, **self.rule_params)
-        except TypeError as err:
-            raise ConfigError(f"rule {self.rule!r}: {self.rule_params}: {err}") from err
+        rule = make_rule(self.rule, self.rule_scorer, self.rule_params)
+        if not rule.decides:
+            raise ConfigError(f"rule {self.rule!r}: {rule.instead}")
+        return rule
 
     def fit(self, reference: Iterable[Episode]) -> Self:
         """Learn from trusted episodes; what was learned before is forgotten.
@@ -323,6 +315,10 @@ class Curation:
         basis: Literal["final", "provisional"] = "final" if final else "provisional"
         seen = _seen("dataset", known)
         resolution = self.scorers_[self.rule_scorer].resolution
+        least = max(rule.min_episodes, _MIN_PROVISIONAL)
+        if not final and len(known) < least:
+            why = f"the rule needs {least} scored episodes; there are {len(known)}"
+            return self._ruling(None, why, basis, seen)
         try:
             rule.fit_dataset(known, resolution=resolution, tie=tie)
         except EpisodeError as err:
@@ -332,7 +328,7 @@ class Curation:
     @property
     def rule_looks_at_dataset(self) -> bool:
         """Whether a decision depends on the scores of the other episodes."""
-        return RULES[self.rule].needs == "dataset"
+        return self._make_rule().needs == "dataset"
 
     @staticmethod
     def is_trusted(seen: Examination) -> bool:

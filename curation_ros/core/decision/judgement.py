@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from curation_ros.core.decision.decision import CURATOR, Decision, Verdict, untrustworthy
 from curation_ros.core.decision.examination import Examination
-from curation_ros.core.decision.rules import Rule
+from curation_ros.core.decision.rules import Case, Rule
 from curation_ros.core.types import NS_PER_S, Span
 
 
@@ -68,13 +68,15 @@ def decide(
         verdict, reason = "review", f"{faults[0].id}: {faults[0].message}{more}"
         part = seen.part
         if part is not None and rule is not None:
-            judged, text = rule.judge(part.scores, part.abstained, part.words, seen.episode)
+            judged, text = rule.verdict(
+                Case(seen.episode, part.scores, part.abstained, part.words)
+            )
             if judged == "keep":
                 verdict, span, reason = "salvage", part.span, f"{text}; without {part.without}"
     elif rule is None:
         verdict, reason = "review", no_rule
     else:
-        verdict, reason = rule.judge(seen.scores, seen.abstained, seen.words, seen.episode)
+        verdict, reason = rule.verdict(Case(seen.episode, seen.scores, seen.abstained, seen.words))
         decided_by = rule.decider(seen.scores)
         facts["decided_by"] = decided_by
         if verdict == "salvage":

@@ -11,7 +11,7 @@ import pytest
 from streams import record, short_episode
 
 from curation_ros.core.decision.decision import Decision
-from curation_ros.core.decision.selection import KEEP_RULES
+from curation_ros.core.decision.rules import RULES
 from curation_ros.dataset.dataset import Dataset
 
 DONE, USAGE, NOTHING = 0, 2, 3
@@ -55,17 +55,16 @@ def test_selection_is_told_to_people(curation: Run, data: Path) -> None:
 
 def test_every_rule_can_be_asked_for(curation: Run, data: Path) -> None:
     values = {"top-k": "3", "top-fraction": "0.4", "threshold": "0.9"}
-    for rule in KEEP_RULES:
+    for rule in (name for name, kind in RULES.items() if kind.selects):
         options = ["--scorer", "gripper_timing", "--value", values[rule]] if rule in values else []
         if rule == "gap":
             told = curation("select", data, "--rule", rule, "--scorer", "gripper_timing")
             assert told.code == NOTHING
-            assert "no two groups" in told.err
-            assert "5 scores are too few" in told.err
+            assert "the rule needs 8 scored episodes; there are 4" in told.err
             continue
         told = curation("select", data, "--rule", rule, *options, "--json")
         assert told.code == DONE, told.err
-        expected = {"decisions": 2, "all": 5, "top-k": 3, "top-fraction": 2, "threshold": 3}
+        expected = {"decisions": 2, "all": 5, "top-k": 3, "top-fraction": 2, "threshold": 2}
         assert told.rows[0]["kept"] == expected[rule]
 
 
@@ -74,7 +73,7 @@ def test_scorer_without_a_rule_that_does_not_separate_selects_nothing(
 ) -> None:
     told = curation("select", data, "--scorer", "gripper_timing", "--json")
     assert (told.code, told.out) == (NOTHING, "")
-    assert "keep rule 'gap': no two groups to choose from: 5 scores are too few" in told.err
+    assert "rule 'gap': the rule needs 8 scored episodes; there are 4; " in told.err
     assert (
         "nothing is selected: have a person review the episodes, or choose by another" in told.err
     )
@@ -113,7 +112,7 @@ def test_phase_that_few_show_is_a_warning(curation: Run, data: Path) -> None:
     assert "phases shown by 2 demonstrations: PREGRASP 2" in told.out
     assert f"warning: RELEASE {said}" in told.err
     told = curation("select", data, "--rule", "all")
-    assert "2 of these are decided to be kept in part: here they are whole" in told.out
+    assert "2 of these are marked salvage: this selection keeps them whole" in told.out
 
 
 def test_seed_orders_equal_scores(curation: Run, data: Path) -> None:
@@ -129,11 +128,11 @@ def test_seed_orders_equal_scores(curation: Run, data: Path) -> None:
     ("arguments", "code", "said"),
     [
         (["--rule", "nose"], USAGE, "nose"),
-        (["--rule", "top-k"], USAGE, "ranks by a scorer"),
-        (["--rule", "top-k", "--scorer", "knn"], USAGE, "value None"),
-        (["--rule", "top-k", "--scorer", "knn", "--value", "9"], USAGE, "only 5 of 5"),
+        (["--rule", "top-k"], USAGE, "reads the scores of a scorer"),
+        (["--rule", "all", "--scorer", "knn"], USAGE, "reads no scores"),
+        (["--rule", "threshold", "--scorer", "knn"], USAGE, "give --value"),
         (["--rule", "top-k", "--scorer", "knn", "--value", "many"], USAGE, "many"),
-        (["--rule", "all", "--value", "3"], USAGE, "value 3.0"),
+        (["--rule", "all", "--value", "3"], USAGE, "takes no value, found 3"),
         (["--rule", "top-k", "--scorer", "nose", "--value", "1"], USAGE, "--write"),
         (["--name", "../evil"], USAGE, "../evil"),
         (["--name", "taken"], NOTHING, "taken.json exists"),

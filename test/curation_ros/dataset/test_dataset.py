@@ -16,7 +16,7 @@ import pytest
 from streams import record, short_episode
 
 from curation_ros.core.decision.decision import Decision
-from curation_ros.core.decision.selection import Entry, Manifest
+from curation_ros.core.decision.manifest import Entry, Manifest
 from curation_ros.core.episode.identity import new_episode_id
 from curation_ros.core.errors import CurationError, EpisodeError
 from curation_ros.dataset.dataset import Dataset

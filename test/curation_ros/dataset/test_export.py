@@ -14,7 +14,7 @@ import pytest
 from streams import record, short_episode
 
 from curation_ros.core.decision.decision import Decision
-from curation_ros.core.decision.selection import Entry, Manifest
+from curation_ros.core.decision.manifest import Entry, Manifest
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.errors import ConfigError, CurationError

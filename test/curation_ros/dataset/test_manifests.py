@@ -13,8 +13,9 @@ from streams import record, same_arrays, short_episode
 
 from curation_ros.core.decision.balance import balance_of, phase_steps
 from curation_ros.core.decision.decision import CURATOR, Decision
-from curation_ros.core.decision.selection import tie_key
+from curation_ros.core.decision.ties import tie_key
 from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.findings import Finding
 from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.errors import BagError, ConfigError, CurationError
 from curation_ros.dataset.dataset import Dataset
@@ -110,6 +111,42 @@ def test_rules_that_rank_keep_the_best_first(
     assert set(manifest.abstained) == {episodes[1].id, episodes[4].id}
     assert manifest.kept_of == 7
     assert manifest.rule_params == {"value": value, "seed": 0}
+
+
+def test_fault_of_the_recording_is_not_selected_by_its_score(
+    dataset: Dataset, rng: np.random.Generator
+) -> None:
+    best, second, third = _recorded(dataset, rng, 3)
+    gap = Finding("gap", "silent", (0, 9))
+    _decide(dataset, best, {"knn": 3.0}, verdict="review", findings=(gap,))
+    _decide(dataset, second, {"knn": 2.0})
+    _decide(dataset, third, {"knn": 1.0})
+    manifest, _ = save_selection(dataset, rule="top-k", value=1, scorer="knn")
+    assert [e.episode for e in manifest.entries] == [second.id]
+    assert manifest.abstained == (best.id,)
+    override(dataset, best.id, "keep", "", "Ada", "")
+    assert _kept(dataset, rule="top-k", value=1, scorer="knn") == [best.id]
+
+
+def test_manifest_has_the_value_that_counted_and_the_method_that_was_asked_for(
+    dataset: Dataset, rng: np.random.Generator
+) -> None:
+    _scored(dataset, rng, [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 9.0, 9.1])
+    manifest, _ = save_selection(dataset, rule="top-fraction", scorer="knn")
+    assert manifest.rule_params == {"value": 0.75, "seed": 0}
+    manifest, _ = save_selection(dataset, scorer="knn", method="largest-gap", seed=2)
+    assert manifest.rule == "gap"
+    assert manifest.rule_params == {"value": None, "seed": 2, "method": "largest-gap"}
+    assert len(manifest.entries) == 2
+
+
+def test_more_than_there_are_keeps_all_and_warns(
+    dataset: Dataset, rng: np.random.Generator
+) -> None:
+    _scored(dataset, rng, [0.5, None, 0.1])
+    manifest, _ = save_selection(dataset, rule="top-k", value=3, scorer="knn")
+    assert len(manifest.entries) == 2
+    assert manifest.warnings()[0].startswith("top-k 3 keeps 2: no other of the 3 episodes")
 
 
 def test_all_keeps_everything_and_asks_for_nothing(
@@ -229,17 +266,18 @@ def test_empty_dataset_gives_no_selection(dataset: Dataset) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"rule": "top-k", "value": 1}, "ranks by a scorer"),
+        ({"rule": "top-k", "value": 1}, "reads the scores of a scorer"),
         (
             {"rule": "top-k", "value": 1, "scorer": "nose"},
             "no episode has a logged score of 'nose'",
         ),
-        ({"rule": "top-k", "value": 4, "scorer": "knn"}, "only 3 of 3"),
-        ({"rule": "top-k", "scorer": "knn"}, "'top-k' with value None"),
-        ({"rule": "top-k", "value": 1.5, "scorer": "knn"}, "'top-k' with value 1.5"),
-        ({"rule": "top-fraction", "value": 2, "scorer": "knn"}, "'top-fraction' with value 2"),
-        ({"rule": "threshold", "value": float("nan"), "scorer": "knn"}, "with value nan"),
-        ({"rule": "decisions", "value": 1}, "'decisions' with value 1"),
+        ({"rule": "all", "scorer": "knn"}, "'all' reads no scores"),
+        ({"rule": "top-k", "value": 1.5, "scorer": "knn"}, "'top-k': value is 1.5"),
+        ({"rule": "top-fraction", "value": 2, "scorer": "knn"}, "'top-fraction': value is 2"),
+        ({"rule": "threshold", "scorer": "knn"}, "'threshold': without a value"),
+        ({"rule": "threshold", "value": float("nan"), "scorer": "knn"}, "threshold is nan"),
+        ({"rule": "decisions", "value": 1}, "'decisions' takes no value, found 1"),
+        ({"rule": "evidence", "scorer": "knn"}, "'evidence': it decides on whole examinations"),
         ({"rule": "nose"}, "'nose'"),
         ({"rule": "all", "name": "../evil"}, "'../evil'"),
         ({"rule": "all", "name": "a b"}, "'a b'"),
