@@ -16,9 +16,8 @@ from rclpy.executors import SingleThreadedExecutor
 
 from curation_ros.core.episode.status import EpisodeEvent, Status, event_to_status
 from curation_ros.core.types import NS_PER_S
-from curation_ros.nodes.messages import array_to_ros, single_from_ros
+from curation_ros.nodes.messages import array_to_ros, message_type, single_from_ros
 from curation_ros.nodes.qos import DECISIONS, LATCHED, MAPPED
-from curation_ros.nodes.subscriptions import message_type
 
 PATIENCE_S = 60.0
 

@@ -14,13 +14,14 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from curation_ros.core.episode.identity import new_episode_id
+from curation_ros.core.episode.messages import PlainMessage
 from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.core.errors import SimError
 from curation_ros.core.types import NS_PER_S
 from sim_node.defects import DefectiveController
 from sim_node.environment import Command, Environment
 from sim_node.episodes import MAX_STEPS, STEPS_AFTER_SUCCESS, EpisodeLimits, Pilot, Run
-from sim_node.output import COMMAND_TOPICS, GRIPPER_JOINT, SimOutput
+from sim_node.messages import COMMAND_TOPICS, GRIPPER_JOINT, RobotMessages, command_messages
 from sim_node.planning import EpisodePlan
 from sim_node.starts import Start
 from sim_node.tasks.task import Step
@@ -73,6 +74,16 @@ class DriveSettings:
         """
         steps = self.max_steps if defect == "none" else self.max_steps_defective or self.max_steps
         return EpisodeLimits(steps, self.steps_after_success)
+
+
+class Output(Protocol):
+    """Takes what the sim node sends: publishers on a graph, a bag without one."""
+
+    def send(self, message: PlainMessage) -> None:
+        """Send a message of an observation or a command."""
+
+    def event(self, event: EpisodeEvent) -> None:
+        """Send an event of an episode."""
 
 
 class Peers(Protocol):
@@ -227,7 +238,7 @@ class Driver:
     def __init__(
         self,
         env: Environment,
-        out: SimOutput,
+        out: Output,
         commands: Commands,
         settings: DriveSettings,
         peers: Peers | None = None,
@@ -235,6 +246,7 @@ class Driver:
     ) -> None:
         self._env = env
         self._out = out
+        self._messages = RobotMessages(env)
         self._commands = commands
         self._settings = settings
         self._peers = peers if peers is not None else NoPeers()
@@ -294,7 +306,8 @@ class Driver:
         command = Command(*controller.act(step))
 
         def act() -> None:
-            self._out.command(self._stamp_ns, *command)
+            for message in command_messages(self._stamp_ns, command):
+                self._out.send(message)
 
         self._commands.accept(self._stamp_ns)
         act()
@@ -331,7 +344,8 @@ class Driver:
         self._stamp_ns = episode.start_ns + step.index * self._env.control_period_ns
 
         def send() -> None:
-            self._out.observation(self._stamp_ns, step, episode.id)
+            for message in self._messages.observation(self._stamp_ns, step, episode.id):
+                self._out.send(message)
 
         send()
         if self.reset_wanted:
@@ -385,7 +399,7 @@ class Driver:
         end_ns = episode.start_ns + max(0, run.n_steps - 1) * self._env.control_period_ns
         # The first observation is in the window even if no command for it was executed.
         n_observed = run.n_steps or int(bool(run.stage))
-        counts = dict.fromkeys(self._out.observation_topics, n_observed)
+        counts = dict.fromkeys(self._messages.types, n_observed)
         counts |= self._commands.counts(episode.start_ns, end_ns)
         return EpisodeEvent(
             episode.id,

@@ -3,31 +3,44 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TwistStamped
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from curation_ros.core.episode.status import ERROR, OK, Status, counts_from_status
+from curation_ros.core.episode.messages import CLOCK, PlainMessage
+from curation_ros.core.episode.status import (
+    ERROR,
+    OK,
+    EpisodeEvent,
+    Status,
+    counts_from_status,
+    event_to_status,
+)
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.nodes.delivery import deliver
 from curation_ros.nodes.health import Health, publishers_found
-from curation_ros.nodes.messages import status_from_ros, time_from_ros
+from curation_ros.nodes.matching import Matching
+from curation_ros.nodes.messages import (
+    array_to_ros,
+    message_type,
+    status_from_ros,
+    time_from_ros,
+    to_ros,
+)
 from curation_ros.nodes.parameters import Parameter, declare
-from curation_ros.nodes.qos import LATCHED, MAPPED
+from curation_ros.nodes.qos import EVENTS, LATCHED, MAPPED
 from curation_ros.nodes.spinning import Finished, run
 from sim_node.defects import DEFECTS
 from sim_node.driving import Commands, DrivenEpisode, Driver, DriveSettings
 from sim_node.env import LiberoEnv
 from sim_node.episodes import MAX_STEPS, STEPS_AFTER_SUCCESS
-from sim_node.output import COMMAND_TOPICS
+from sim_node.messages import CLOCK_TOPIC, COMMAND_TOPICS, COMMAND_TYPES, RobotMessages
 from sim_node.planning import EpisodePlan, plan_episodes
-from sim_node.publishing import SimPublishers
 from sim_node.starts import parse_starts
 
 PARAMETERS = (
@@ -54,6 +67,76 @@ PARAMETERS = (
 _REPORT_S = 5.0
 
 
+#: Stands for the name of a publisher's node until the name has been discovered.
+_UNNAMED = "_NODE_NAME_UNKNOWN_"
+
+
+class _Publishers:
+    """All publishers of the sim node; `episode` and the commands exist only for their owner.
+
+    Args:
+        node: the sim node.
+        observation_types: topic -> message type of all observations.
+        owner: whether this node owns the episodes.
+        expert: whether this node gives the commands.
+    """
+
+    def __init__(
+        self, node: Node, observation_types: Mapping[str, str], *, owner: bool, expert: bool
+    ) -> None:
+        self._node = node
+        self.observation_topics = tuple(observation_types)
+        make = node.create_publisher
+        self._episode = make(DiagnosticArray, "episode", LATCHED) if owner else None
+        self._outcome = make(DiagnosticArray, "episode/outcome", LATCHED) if owner else None
+        types = {**observation_types, **(COMMAND_TYPES if expert else {})}
+        self._publishers = {t: make(message_type(kind), t, MAPPED) for t, kind in types.items()}
+        self._publishers[CLOCK_TOPIC] = make(message_type(CLOCK), CLOCK_TOPIC, EVENTS)
+        self._matching = Matching(node)
+
+    def send(self, message: PlainMessage) -> None:
+        """Publish a message of an observation or a command."""
+        self._publishers[message.topic].publish(to_ros(message.type, message.content))
+
+    def event(self, event: EpisodeEvent) -> None:
+        """Publish an event of an episode.
+
+        This does not wait for acknowledgements: Fast DDS asks for them every 3 s only. Later
+        messages overtake an event only where a packet is lost. Use `wait_for` with the recorder
+        to be sure.
+        """
+        if self._episode is not None:
+            self._episode.publish(array_to_ros([event_to_status(event)], event.start_ns))
+
+    def outcome(self, status: Status) -> None:
+        """Publish an outcome, for evaluation only."""
+        if self._outcome is not None:
+            stamp_ns = self._node.get_clock().now().nanoseconds
+            self._outcome.publish(array_to_ros([status], stamp_ns))
+
+    def flush(self) -> None:
+        """Wait until every subscriber has everything of our episodes."""
+        if self._episode is not None:
+            observations = [self._publishers[topic] for topic in self.observation_topics]
+            deliver([self._episode, self._outcome, *observations])
+
+    def is_matched(self, node_name: str) -> bool:
+        """Whether a node runs and has subscribed, to `episode` too if that is ours."""
+        topics = [] if self._episode is None else [self._episode.topic_name]
+        return self._matching.is_complete(node_name, topics)
+
+
+def several_commanders(node: Node) -> str:
+    """Names of the nodes that send commands, if there are several or one has two publishers."""
+    infos = [i for t in COMMAND_TOPICS for i in node.get_publishers_info_by_topic(t)]
+    # A publisher is discovered a moment before the name of its node.
+    infos = [i for i in infos if i.node_name != _UNNAMED]
+    owners = {(i.node_namespace, i.node_name) for i in infos}
+    if len(owners) <= 1 and len(infos) <= len(COMMAND_TOPICS):
+        return ""
+    return " and ".join(sorted(name for _, name in owners)) + f" ({len(infos)} publishers)"
+
+
 class SimNode(Node):
     """Owns the episodes: says where each starts and ends, and what was executed in between."""
 
@@ -78,7 +161,9 @@ class SimNode(Node):
         self._env = LiberoEnv(lean=p["lean"])
         ready_s = time.perf_counter() - began_s
         self.get_logger().info(f"LIBERO and {len(starts)} starts ready in {ready_s:.1f} s")
-        self._out = SimPublishers(self, self._env, owner=p["episodes"] > 0, expert=self._expert)
+        self._out = _Publishers(
+            self, RobotMessages(self._env).types, owner=p["episodes"] > 0, expert=self._expert
+        )
         self._commands = Commands()
         settings = DriveSettings(**{field.name: p[field.name] for field in fields(DriveSettings)})
         self._driver = Driver(self._env, self._out, self._commands, settings, peers=self)
@@ -86,8 +171,8 @@ class SimNode(Node):
         self._recorder: dict[str, Status] = {}
         self._outcomes: list[str] = []
         if not self._expert:
-            for topic, kind in zip(COMMAND_TOPICS, (TwistStamped, JointState), strict=True):
-                self.create_subscription(kind, topic, self._taker(topic), MAPPED)
+            for topic, kind in COMMAND_TYPES.items():
+                self.create_subscription(message_type(kind), topic, self._taker(topic), MAPPED)
         self.create_subscription(DiagnosticArray, "recorder/status", self._on_recorder, LATCHED)
         self.create_service(Trigger, "~/reset", self._reset)
         self._health = Health(self)
@@ -167,7 +252,7 @@ class SimNode(Node):
 
     def several_commanders(self) -> str:
         """Names of the nodes that send commands if there are several, or empty."""
-        return self._out.several_commanders()
+        return several_commanders(self)
 
     def _until_recorder(self, episode_id: str, *states: str) -> Iterator[bool]:
         """Wait until the recorder reports one of these states of an episode."""

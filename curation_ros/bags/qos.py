@@ -89,6 +89,13 @@ class QosProfile:
         )
 
 
+MAPPED = QosProfile(depth=1000)
+"""Mapped and command topics.
+
+An episode of up to 1,000 steps fits: a subscriber that stalls for a whole episode loses nothing.
+"""
+
+
 def qos_to_yaml(profiles: tuple[QosProfile, ...]) -> str:
     """Text of the channel metadata `offered_qos_profiles`."""
     return dump_yaml([p.to_rosbag2() for p in profiles])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from curation_ros.bags import qos
+
 
 def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:
     return QoSProfile(
@@ -14,9 +16,8 @@ def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:
     )
 
 
-#: Mapped and command topics. An episode of up to 1,000 steps fits, so that a subscriber that
-#: stalls for a whole episode loses nothing.
-MAPPED = _profile(1000, DurabilityPolicy.VOLATILE)
+#: Mapped and command topics, see `curation_ros.bags.qos.MAPPED`.
+MAPPED = _profile(qos.MAPPED.depth, DurabilityPolicy.VOLATILE)
 #: `episode` and `recorder/status`: who comes late still sees the last ones.
 LATCHED = _profile(10, DurabilityPolicy.TRANSIENT_LOCAL)
 #: `curator/decision`: the last 200.

@@ -23,11 +23,10 @@ from curation_ros.core.episode.stream import Sample, playback_order
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.types import NS_PER_S
 from curation_ros.nodes.matching import Matching
-from curation_ros.nodes.messages import array_to_ros, status_from_ros
+from curation_ros.nodes.messages import array_to_ros, message_type, status_from_ros
 from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import DECISIONS, EVENTS, LATCHED, MAPPED
 from curation_ros.nodes.spinning import Finished, run
-from curation_ros.nodes.subscriptions import message_type
 
 PARAMETERS = (
     Parameter("bags", (), "datasets, folders of bags, bags or .mcap files to play, in order"),

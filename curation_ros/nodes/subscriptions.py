@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -12,25 +11,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from curation_ros.bags.qos import QosProfile
 from curation_ros.core.episode.stream import Sample, header_stamp_ns
 from curation_ros.core.episode.topic_map import TopicMap
-from curation_ros.core.errors import ConfigError, EpisodeError
+from curation_ros.core.errors import EpisodeError
 from curation_ros.nodes.health import publishers_found
+from curation_ros.nodes.messages import message_type
 from curation_ros.nodes.qos import MAPPED
-
-
-def message_type(type_name: str, topic: str = "") -> type:
-    """The Python class of a message type.
-
-    Raises:
-        ConfigError: if its package is not installed here; bags of it can still be scored.
-    """
-    package, _, name = type_name.split("/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), name)  # type: ignore[no-any-return]
-    except (ImportError, AttributeError):
-        raise ConfigError(
-            f"topic {topic!r}: message type {type_name} is not installed: install "
-            f"ros-jazzy-{package.replace('_', '-')}, or score bags of it offline"
-        ) from None
 
 
 class MappedSubscriptions:

@@ -9,21 +9,19 @@ from __future__ import annotations
 
 import fcntl
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from curation_ros.bags.qos import QosProfile
-from curation_ros.bags.schemas import jazzy_typestore
+from curation_ros.bags.messages import to_cdr
+from curation_ros.bags.qos import MAPPED
 from curation_ros.batch.workers import WorkerDiedError, spread
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.episode.identity import new_episode_id
-from curation_ros.core.episode.status import EpisodeEvent, Status
+from curation_ros.core.episode.messages import PlainMessage
+from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.core.episode.stream import Sample
 from curation_ros.core.errors import BagError, ConfigError, CurationError
 from curation_ros.core.types import NS_PER_S
@@ -31,15 +29,9 @@ from curation_ros.dataset.dataset import Dataset
 from curation_ros.live.recorder import Notice, RecordedTopic, Recording, recover_partials
 from sim_node.driving import Commands, Driver, DriveSettings
 from sim_node.env import CONTROL_RATE_HZ, process_env
-from sim_node.environment import Environment
 from sim_node.episodes import MAX_STEPS, STEPS_AFTER_SUCCESS, run_to_end
-from sim_node.output import SimOutput
 from sim_node.planning import EpisodePlan, plan_episodes
 from sim_node.starts import start_by_name, start_names
-
-#: As `curation_ros.nodes.qos.MAPPED`, by which the graph's recorder subscribes.
-_QOS = QosProfile(depth=1000)
-_FRAME = "world"
 
 
 @dataclass(frozen=True)
@@ -210,7 +202,7 @@ def _collect(
     """One episode, in a worker."""
     try:
         dataset = Dataset(folder)
-        output = RecordedOutput(process_env(), dataset)
+        output = BagOutput(dataset)
         driver = Driver(
             process_env(), output, Commands(), collection.drive_settings, stamp_ns=stamp_ns
         )
@@ -222,27 +214,25 @@ def _collect(
     return Collected(name, episode.truth(), episode.reason)
 
 
-class RecordedOutput(SimOutput):
-    """Writes what the sim says into a dataset, as a recorder does that loses nothing.
+class BagOutput:
+    """Writes what the sim node would send into a dataset, as a recorder that loses nothing.
 
     Args:
-        env: the simulator.
         dataset: where the bag of each episode goes.
     """
 
-    def __init__(self, env: Environment, dataset: Dataset) -> None:
-        super().__init__(env)
+    def __init__(self, dataset: Dataset) -> None:
         topic_map = topic_map_or_default("")
-        topics = {t: RecordedTopic(f"/{t}", kind, _QOS) for t, kind in topic_map.topics.items()}
+        topics = {t: RecordedTopic(f"/{t}", kind, MAPPED) for t, kind in topic_map.topics.items()}
         self._recording = Recording(dataset, topic_map, topics)
         self._seqs = dict.fromkeys(topics, 0)
         self._last: Notice | None = None
 
     def check_closed(self) -> None:
-        """Complain if the last episode has no whole bag.
+        """Check that the bag of the last episode is whole.
 
         Raises:
-            BagError: with the reason.
+            BagError: with the reason if it is not.
         """
         if self._last is None or self._last.state != "closed":
             reason = self._last.reason if self._last is not None else "it never started"
@@ -250,72 +240,22 @@ class RecordedOutput(SimOutput):
 
     def event(self, event: EpisodeEvent) -> None:
         """Open or close a bag."""
-        self._heard(self._recording.event(event, time.monotonic()))
+        self._keep(self._recording.event(event, time.monotonic()))
 
-    def _joints(
-        self,
-        topic: str,
-        names: Sequence[str],
-        position: Iterable[float],
-        velocity: Iterable[float],
-        effort: Iterable[float],
-        stamp_ns: int,
-    ) -> None:
-        columns = (np.array([*v], dtype=np.float64) for v in (position, velocity, effort))
-        self._take(topic, stamp_ns, "", list(names), *columns)
-
-    def _pose(
-        self, topic: str, position_m: Iterable[float], quat_xyzw: Iterable[float], stamp_ns: int
-    ) -> None:
-        m = _messages()
-        pose = m["Pose"](m["Point"](*position_m), m["Quaternion"](*quat_xyzw))
-        self._take(topic, stamp_ns, _FRAME, pose)
-
-    def _twist(self, topic: str, xyz: Iterable[float], stamp_ns: int) -> None:
-        m = _messages()
-        self._take(topic, stamp_ns, _FRAME, m["Twist"](m["Vector3"](*xyz), m["Vector3"](0, 0, 0)))
-
-    def _status(self, topic: str, status: Status, stamp_ns: int) -> None:
-        m = _messages()
-        values = [m["KeyValue"](key, value) for key, value in status.values.items()]
-        one = m["DiagnosticStatus"](
-            status.level, status.name, status.message, status.hardware_id, values
-        )
-        self._take(topic, stamp_ns, "", [one])
-
-    def _take(self, topic: str, stamp_ns: int, frame: str, *members: Any) -> None:
-        """Record a message of a mapped topic: its header, then its other members."""
-        recorded = self._recording.topics.get(topic)
-        if recorded is None:
+    def send(self, message: PlainMessage) -> None:
+        """Record a message if its topic is mapped."""
+        if message.topic not in self._seqs:
             return
-        m = _messages()
-        header = m["Header"](m["Time"](*divmod(stamp_ns, NS_PER_S)), frame)
-        message = m[recorded.type.rpartition("/")[2]](header, *members)
-        data = bytes(jazzy_typestore().serialize_cdr(message, recorded.type))
-        self._seqs[topic] += 1
+        self._seqs[message.topic] += 1
+        stamp = message.content["header"]["stamp"]
+        stamp_ns = stamp["sec"] * NS_PER_S + stamp["nanosec"]
+        data = to_cdr(message.type, message.content)
         now_ns = time.time_ns()
-        sample = Sample(topic, stamp_ns, self._seqs[topic], data, now_ns, now_ns)
-        self._heard(self._recording.sample(sample, time.monotonic()))
+        sample = Sample(message.topic, stamp_ns, self._seqs[message.topic], data, now_ns, now_ns)
+        self._keep(self._recording.sample(sample, time.monotonic()))
 
-    def _heard(self, notices: Sequence[Notice]) -> None:
+    def _keep(self, notices: Sequence[Notice]) -> None:
         for notice in notices:
             # What failed once stays so: later notices are about its remains.
             if self._last is None or self._last.state != "failed" or notice.state == "recording":
                 self._last = notice
-
-
-@cache
-def _messages() -> dict[str, Any]:
-    """Message classes, by the last part of their type's name."""
-    packages = (
-        "builtin_interfaces/",
-        "diagnostic_msgs/",
-        "geometry_msgs/",
-        "sensor_msgs/",
-        "std_",
-    )
-    return {
-        name.rpartition("/")[2]: kind
-        for name, kind in jazzy_typestore().types.items()
-        if name.startswith(packages)
-    }

@@ -18,7 +18,7 @@ from curation_ros.dataset.dataset import Dataset
 pytestmark = [pytest.mark.ros, pytest.mark.sim]
 pytest.importorskip("libero", reason="LIBERO is not installed")
 
-from sim_node.publishing import SimPublishers  # noqa: E402 - needs LIBERO
+from sim_node.node import several_commanders  # noqa: E402 - needs LIBERO
 
 PERIOD_NS = 50_000_000
 MAX_STEPS = 12
@@ -180,8 +180,7 @@ def test_publisher_that_has_no_name_yet_is_no_second_commander():
 
     def commanders(*names):
         seen = [SimpleNamespace(node_namespace="/", node_name=name) for name in names]
-        node = SimpleNamespace(get_publishers_info_by_topic=lambda _: seen)
-        return SimPublishers.several_commanders(SimpleNamespace(_node=node))
+        return several_commanders(SimpleNamespace(get_publishers_info_by_topic=lambda _: seen))
 
     assert commanders("policy_node") == ""
     assert commanders("_NODE_NAME_UNKNOWN_") == ""

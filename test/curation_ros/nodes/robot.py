@@ -31,13 +31,13 @@ try:
     from curation_ros.nodes.messages import (
         array_to_ros,
         joints_to_ros,
+        message_type,
         pose_to_ros,
         time_from_ros,
         time_to_ros,
         twist_to_ros,
     )
     from curation_ros.nodes.qos import LATCHED, MAPPED
-    from curation_ros.nodes.subscriptions import message_type
 except ImportError as err:
     pytest.skip(f"rclpy is not installed: {err}", allow_module_level=True)
 
