@@ -68,6 +68,14 @@ def test_links_and_anchors_resolve(page: Path) -> None:
 
 
 @pages
+def test_files_of_this_repository_exist(page: Path) -> None:
+    folders = "core|curation_ros|sim_node|policy_node|test|benchmarks|config|docs|launch|results"
+    for code in code_of(page.read_text()):
+        for path in re.findall(rf"(?<![\w/.<])(?:{folders})/[\w/]+\.(?:py|md|yaml)\b", code):
+            assert any((root / path).exists() for root in (ROOT, ROOT / "curation_ros")), path
+
+
+@pages
 def test_commands_and_their_flags_exist(page: Path) -> None:
     for command, rest in calls_of(page.read_text()):
         assert command in COMMANDS, f"curation {command}{rest}"
