@@ -35,8 +35,9 @@ from curation_ros.core.decision.rules import RULES
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap, topic_map_from_json
 from curation_ros.core.evidence.alerts import AlertWatch
-from curation_ros.core.evidence.carrying import Carrying, carrying_of
-from curation_ros.core.evidence.fingers import grip_of
+from curation_ros.core.evidence.carrying import carrying_of
+from curation_ros.core.evidence.fingers import held_by_fingers
+from curation_ros.core.evidence.holds import Carrying
 from curation_ros.core.scorers import SCORERS, Abstain
 from curation_ros.core.statistics.intervals import clopper_pearson
 from curation_ros.core.types import NS_PER_S
@@ -166,8 +167,10 @@ DETECTORS: dict[str, Callable[[Episode, np.random.Generator], Verdict]] = {
     "object, 10 mm noise, 100 ms delay, 30 % dropout": lambda e, rng: _of(
         carrying_of(degraded(e, rng))
     ),
-    "no object: gap of the fingers": lambda e, _: _of(grip_of(e)),
-    "no object: effort of the fingers": lambda e, _: _of(grip_of(e, effort="finger_effort")),
+    "no object: gap of the fingers": lambda e, _: _of(held_by_fingers(e)),
+    "no object: effort of the fingers": lambda e, _: _of(
+        held_by_fingers(e, effort="finger_effort")
+    ),
     "no object: commands within phases": lambda e, _: _of_events(e),
     "object, exact pose, no phases": lambda e, _: _of(carrying_of(without(e, "phase"))),
 }

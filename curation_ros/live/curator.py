@@ -158,7 +158,7 @@ class LiveCuration:
         """Look for an alert, where all topics have moved on for long enough."""
         live = self._live[episode_id]
         now_ns = live.builder.settled_ns
-        if live.watch.has_spoken or now_ns < live.looked_ns + int(ALERT_PERIOD_S * NS_PER_S):
+        if live.watch.has_alerted or now_ns < live.looked_ns + int(ALERT_PERIOD_S * NS_PER_S):
             return
         live.looked_ns = now_ns
         finding = live.watch.take(live.builder.settled())

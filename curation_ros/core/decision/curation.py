@@ -17,7 +17,8 @@ from curation_ros.core.decision.state_hash import state_hash
 from curation_ros.core.decision.ties import TieKey
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.errors import ConfigError, EpisodeError, NotFittedError
-from curation_ros.core.evidence.checks import Baseline, check_episode
+from curation_ros.core.evidence.baseline import Baseline
+from curation_ros.core.evidence.checks import check_episode
 from curation_ros.core.evidence.gripper import gripper_findings
 from curation_ros.core.evidence.length_control import LengthControl
 from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, Look, PoolScorer, Scorer

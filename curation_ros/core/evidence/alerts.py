@@ -1,149 +1,148 @@
 """Alerts: what has gone wrong with an episode that still runs.
 
-The evidence is that of rule `evidence`, in its order: the pose of the object; where that cannot
-tell, what the fingers hold; and, where the pose has not told it sooner, the command to open.
+The evidence is that of rule `evidence`, in its order: the pose of the object; if that gives no
+answer, the fingers; and the command to open, if the pose has not shown the loss earlier.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.evidence.carrying import (
-    GRASP_S,
-    CarryWatch,
-    Hold,
-    carry_labels,
-    watched,
-)
-from curation_ros.core.evidence.fingers import grip_of
+from curation_ros.core.evidence.carrying import CarryWatch, watched
+from curation_ros.core.evidence.fingers import held_by_fingers
 from curation_ros.core.evidence.gripper import commanded, contradiction
+from curation_ros.core.evidence.holds import GRASP_S, Hold, carry_labels
 from curation_ros.core.types import NS_PER_S
 
 if TYPE_CHECKING:
     from curation_ros.core.episode.episode import Episode
     from curation_ros.core.episode.topic_map import TopicMap
 
-#: With one of these so far, values may be older than they look: then nobody is alarmed.
+#: After one of these findings values may be older than they look: then there is no alert.
 _BLINDING = ("clock-back", "duplicate-stamp", "not-finite", "undecodable")
-#: A gripper that stays open for so long was not opened by a slip of the thumb; a pose that is
-#: worth its name has shown by then what came of it.
+#: A gripper that stays open this long was not opened by accident. By then a usable pose has shown
+#: what became of the object.
 OPEN_S = 0.2
-#: Steps of it within the phase: a topic may be one behind the other.
+#: Steps of the opening that lie within the phase: topics may differ by one step.
 _OPEN_STEPS = 2
-#: Beside what is lost, `opened-early` is told; the others are what is lost.
+#: Alerts that something was lost. `opened-early` is the other one; both may be raised.
 LOST = ("grip-lost", "not-carried", "object-lost")
 
-#: What can be told: the step at which it was sure, since when that needs whole data, and what.
-_Told = tuple[int, int, Finding]
+
+class _Alert(NamedTuple):
+    """An alert that is possible.
+
+    Attributes:
+        step: at which it became certain.
+        since_ns: nanoseconds from the start stamp; from there on the data must have no gap.
+        finding: the alert itself.
+    """
+
+    step: int
+    since_ns: int
+    finding: Finding
 
 
 class AlertWatch:
-    """Looks at an episode as it grows, and says once what the operator must know now.
+    """Watches an episode that grows, and raises one alert as soon as it is certain.
 
-    Invariant: it says the same of an episode that grows as of the whole one at once; only sooner.
+    Invariant: the alert of a running episode is that of the complete one, only sooner.
 
     Args:
         topic_map: of the episode.
-        usual: ids of findings that trusted episodes show, too; they are not told.
+        usual: ids of findings that trusted episodes show as well; they raise no alert.
 
     Attributes:
-        has_spoken: whether it has said what it had to say.
+        has_alerted: whether the alert was raised.
     """
 
     def __init__(self, topic_map: TopicMap, *, usual: Collection[str] = ()) -> None:
         self._watch = CarryWatch(topic_map)
         self._usual = frozenset(usual)
-        self.has_spoken = False
+        self.has_alerted = False
 
     def take(self, episode: Episode) -> Finding | None:
-        """Look at the steps that are new.
+        """Take the steps that are new.
 
         Args:
-            episode: so far, from its first step on.
+            episode: the episode so far, from its first step on.
 
         Returns:
-            The first that is sure of: `object-lost`, `not-carried` (both by pose), `grip-lost`
-            (by the fingers, where the pose cannot tell) and `opened-early` (by a command that
-            lasts for OPEN_S); None if there is none, and when it has spoken.
+            The first of these that is certain: `object-lost` or `not-carried` (by the pose),
+            `grip-lost` (by the fingers, if the pose gives no answer), `opened-early` (by a
+            command that lasts for OPEN_S). None if there is none, and after an alert.
         """
-        if self.has_spoken:
+        if self.has_alerted:
             return None
-        told = [f for f in self.all(episode) if f.id not in self._usual]
-        self.has_spoken = bool(told)
-        return told[0] if told else None
-
-    def all(self, episode: Episode) -> list[Finding]:
-        """Everything that it could say by now, in the order in which it became sure."""
         self._watch.take(episode)
-        return _alerts(episode, self._watch.losses, self._watch.blind_from)
+        alerts = _alerts(episode, self._watch.losses, self._watch.blind_from)
+        first = next((f for f in alerts if f.id not in self._usual), None)
+        self.has_alerted = first is not None
+        return first
 
 
 def alerts_of(episode: Episode) -> list[Finding]:
-    """Every alert of a whole episode, in the order in which it became sure."""
-    seen = watched(episode)
-    return _alerts(episode, seen.losses, seen.blind_from)
+    """All possible alerts of a complete episode, in the order in which they became certain."""
+    found = watched(episode)
+    return _alerts(episode, found.losses, found.blind_from)
 
 
 def _alerts(episode: Episode, losses: Sequence[Hold], blind_from: int | None) -> list[Finding]:
     if any(f.id in _BLINDING for f in episode.findings):
         return []
     gaps = [f.span for f in episode.findings if f.id == "gap"]
-    by_pose = [told for hold in losses for told in _lost(hold, episode)]
+    by_pose = [alert for hold in losses for alert in _lost(hold, episode)]
     found = [
-        (at, finding)
-        for at, since_ns, finding in (*by_pose, *_by_gripper(episode, blind_from))
-        if not any(a <= finding.span[1] and b >= since_ns for a, b in gaps)
+        alert
+        for alert in (*by_pose, *_by_gripper(episode, blind_from))
+        if not any(a <= alert.finding.span[1] and b >= alert.since_ns for a, b in gaps)
     ]
-    return [finding for _, finding in sorted(found, key=lambda told: told[0])]
+    return [alert.finding for alert in sorted(found, key=lambda alert: alert.step)]
 
 
-def _by_gripper(episode: Episode, blind_from: int | None) -> list[_Told]:
+def _by_gripper(episode: Episode, blind_from: int | None) -> list[_Alert]:
     found = []
     if blind_from is not None:
-        # Without phases nobody says that every closing was to hold something.
+        # Without phases, an empty closing need not have been meant to hold anything.
         states = ("broken", "never") if carry_labels(episode.topic_map) else ("broken",)
-        holds = [h for h in grip_of(episode).holds if h.state in states]
-        for told in (t for hold in holds for t in _lost(hold, episode, by_grip=True)):
-            found.append((max(told[0], blind_from), *told[1:]))
+        holds = [h for h in held_by_fingers(episode).holds if h.state in states]
+        for alert in (a for hold in holds for a in _lost(hold, episode, by_fingers=True)):
+            found.append(alert._replace(step=max(alert.step, blind_from)))
     found += _opened(episode)
-    # Of what was known by then: without a meaning, neither command nor width tell anything.
+    # By what was known at the time: if the command's meaning is in doubt, it proves nothing.
     with np.errstate(invalid="ignore", over="ignore"):
-        return [t for t in found if contradiction(episode.steps(t[0] + 1)) is None]
+        return [a for a in found if contradiction(episode.steps(a.step + 1)) is None]
 
 
-def _lost(hold: Hold, episode: Episode, *, by_grip: bool = False) -> list[_Told]:
-    """That something was lost, or left behind: its phase and time in the message.
+def _lost(hold: Hold, episode: Episode, *, by_fingers: bool = False) -> list[_Alert]:
+    """The alert that something was lost or left behind; none if the hold does not show that.
 
-    The span is from the first step of leaving to the one at which that was sure; none where the
-    hold does not say so for sure.
+    Its span runs from the first step of leaving to the one at which that was certain.
     """
     if hold.departed is None or hold.noticed is None:
         return []
-    left_ns, sure_ns = episode.span(hold.departed, hold.noticed)
+    left_ns, certain_ns = episode.span(hold.departed, hold.noticed)
     at = f"{left_ns / NS_PER_S:.2f} s{f' in {hold.phase}' if hold.phase else ''}"
-    if by_grip:
+    if by_fingers:
         what = "had let go" if hold.opened else "held nothing"
-        finding = Finding(
-            "grip-lost", f"the fingers {what} at {at}, as {hold.object} shows", (left_ns, sure_ns)
-        )
+        id_, text = "grip-lost", f"the fingers {what} at {at}, as {hold.object} shows"
     elif hold.state == "never":
         text = f"{hold.object} was left behind at {at}, the effector went on without it"
-        finding = Finding("not-carried", text, (left_ns, sure_ns))
+        id_ = "not-carried"
     else:
         opened = ", after a command to open" if hold.opened else ""
-        text = f"{hold.object} left the effector at {at}{opened}"
-        finding = Finding("object-lost", text, (left_ns, sure_ns))
+        id_, text = "object-lost", f"{hold.object} left the effector at {at}{opened}"
     since_ns = episode.span(hold.first, hold.first)[0] - int(GRASP_S * NS_PER_S)
-    return [(hold.noticed, since_ns, finding)]
+    return [_Alert(hold.noticed, since_ns, Finding(id_, text, (left_ns, certain_ns)))]
 
 
-def _opened(episode: Episode) -> list[_Told]:
-    """That a gripper that had closed was told to open, where something is to be carried."""
+def _opened(episode: Episode) -> list[_Alert]:
+    """Alerts that a closed gripper was commanded to open while something is to be carried."""
     labels, phase = carry_labels(episode.topic_map), episode.phase
     if not labels or phase is None:
         return []
@@ -153,15 +152,17 @@ def _opened(episode: Episode) -> list[_Told]:
         return []
     is_open = (state > 0) & np.logical_or.accumulate(state < 0)
     in_carry = is_open & np.isin(phase, list(labels))
-    shut = np.flatnonzero(~is_open)
+    not_open = np.flatnonzero(~is_open)
     stamps = episode.stamps_ns
-    found: list[_Told] = []
+    found: list[_Alert] = []
     for step in np.flatnonzero(in_carry & ~np.concatenate([[False], in_carry[:-1]])).tolist():
-        sure = int(np.searchsorted(stamps, stamps[step] + int(OPEN_S * NS_PER_S)))
-        is_long = sure < len(stamps) and not ((shut > step) & (shut <= sure)).any()
-        if is_long and in_carry[step : step + _OPEN_STEPS].all():
-            span = episode.span(step, sure)
+        certain = int(np.searchsorted(stamps, stamps[step] + int(OPEN_S * NS_PER_S)))
+        closed_again = ((not_open > step) & (not_open <= certain)).any()
+        if certain >= len(stamps) or closed_again:
+            continue
+        if in_carry[step : step + _OPEN_STEPS].all():
+            span = episode.span(step, certain)
             where = labels[int(phase[step])]
             text = f"the gripper was commanded to open at {span[0] / NS_PER_S:.2f} s in {where}"
-            found.append((sure, span[0], Finding("opened-early", text, span)))
+            found.append(_Alert(certain, span[0], Finding("opened-early", text, span)))
     return found

@@ -1,6 +1,6 @@
-"""What the gripper was told and what its fingers did: the one place that knows the sign.
+"""Command and width of the gripper: the one module that knows the sign of the command.
 
-Every function takes its meaning from the topic map's `GripperSpec`, never from a robot's names.
+Every function takes the meaning from the topic map's `GripperSpec`, never from a robot's names.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from curation_ros.core.types import Floats, Mask
 
 
-#: Fingers must have begun to follow a switch of the command after this long (10 steps at 20 Hz).
-SETTLE_S = 0.5
-#: Movement of less than this share of the largest width is no evidence of anything.
+#: Fingers have begun to follow a switch of the command after this time (10 steps at 20 Hz).
+FINGER_DELAY_S = 0.5
+#: A movement of less than this share of the largest width proves nothing.
 STILL_SHARE = 0.1
-#: Hysteresis on the width, as shares of its range in the episode: below, above.
+#: Hysteresis on the width, as shares of its range in the episode: closed below, open above.
 CLOSED_SHARE, OPEN_SHARE = 0.25, 0.75
-#: Continuous commands beyond the declared ends by more than this share of their distance are
-#: stray; fewer of them than the other share are a glitch, not another meaning.
+#: A continuous command is stray if it lies beyond the declared ends by more than this share of
+#: their distance. Fewer stray commands than the other share are a glitch, not another meaning.
 MARGIN_SHARE, STRAY_SHARE = 0.1, 0.05
 
 
@@ -41,7 +41,7 @@ def _spec(episode: Episode) -> GripperSpec:
 
 
 def gripper_command(episode: Episode) -> Floats:
-    """(T,) command of the gripper in its own unit.
+    """(T,) command of the gripper, in its own unit.
 
     Raises:
         EpisodeError: if there is no gripper, no such field, or it has several columns.
@@ -57,7 +57,7 @@ def gripper_command(episode: Episode) -> Floats:
 
 
 def _held(sign: npt.NDArray[np.int8]) -> npt.NDArray[np.int8]:
-    """Replace every 0 by the last value before it that is not 0; leading zeros stay."""
+    """Replace each 0 by the last value before it that is not 0. Leading zeros stay."""
     index = np.maximum.accumulate(np.where(sign != 0, np.arange(len(sign)), 0))
     held: npt.NDArray[np.int8] = sign[index]
     return held
@@ -65,7 +65,10 @@ def _held(sign: npt.NDArray[np.int8]) -> npt.NDArray[np.int8]:
 
 @once_per_episode
 def commanded(episode: Episode) -> npt.NDArray[np.int8]:
-    """(T,) what the gripper is commanded to be: +1 open, -1 closed, 0 nothing commanded yet.
+    """(T,) commanded state of the gripper: +1 open, -1 closed, 0 before the first command.
+
+    Binary: the sign decides, and 0 holds the previous command. Continuous: the nearer end
+    decides, and the exact middle holds.
 
     Raises:
         EpisodeError: if the topic map declares no gripper or the episode lacks its field.
@@ -76,16 +79,13 @@ def commanded(episode: Episode) -> npt.NDArray[np.int8]:
         towards_open = command * spec.opens
     else:
         towards_open = np.abs(command - spec.closed_value) - np.abs(command - spec.open_value)
-    # NaN compares false both ways, so it holds, as 0 does.
+    # NaN compares false both ways, so it holds the previous command, as 0 does.
     sign = (towards_open > 0).astype(np.int8) - (towards_open < 0).astype(np.int8)
     return _held(sign)
 
 
 def is_open_command(episode: Episode) -> Mask:
-    """(T,) whether the gripper is under the command to open.
-
-    Binary: the sign decides and 0 holds the previous command. Continuous: the nearer end decides,
-    the exact middle holds. Before the first command it is neither open nor closed.
+    """(T,) whether the gripper is commanded to open; see `commanded`.
 
     Raises:
         EpisodeError: if the topic map declares no gripper or the episode lacks its field.
@@ -95,13 +95,17 @@ def is_open_command(episode: Episode) -> Mask:
 
 
 def is_closed_command(episode: Episode) -> Mask:
-    """(T,) whether the gripper is under the command to close; see `is_open_command`."""
+    """(T,) whether the gripper is commanded to close; see `commanded`.
+
+    Raises:
+        EpisodeError: if the topic map declares no gripper or the episode lacks its field.
+    """
     mask: Mask = commanded(episode) < 0
     return mask
 
 
 def opening_of(state: npt.NDArray[np.int8]) -> int | None:
-    """First step that is open (+1) after one that was closed (-1); None if there is none."""
+    """First step that is open (+1) after a closed one (-1); None if there is none."""
     if not len(state):
         return None
     hits = np.flatnonzero((state > 0) & np.logical_or.accumulate(state < 0))
@@ -109,9 +113,9 @@ def opening_of(state: npt.NDArray[np.int8]) -> int | None:
 
 
 def first_opening(episode: Episode) -> int | None:
-    """First step commanded open after having been commanded closed; None if there is none.
+    """First step that is commanded open after a closed one; None if there is none.
 
-    The opening of the approach does not count: nothing had been closed before it.
+    An open gripper in the approach does not count, as it was not closed before.
 
     Raises:
         EpisodeError: if the topic map declares no gripper or the episode lacks its field.
@@ -123,62 +127,54 @@ def first_opening(episode: Episode) -> int | None:
 def finger_width(episode: Episode) -> Floats | None:
     """(T,) distance between the fingers in the field's unit, larger when open.
 
-    The spread of the field's columns. A single column is taken as the width itself; columns that
-    are equal at every step (mimic joints, as of a Franka hand) are taken as half a width each.
+    This is the spread of the field's columns. A single column is the width itself. Columns that
+    are equal at every step (mimic joints, as of a Franka hand) are half a width each.
 
     Returns:
-        None where the topic map declares no gripper or no fingers.
+        None if the topic map declares no gripper or no fingers.
+
+    Raises:
+        EpisodeError: if the episode lacks the declared field.
     """
     spec = episode.topic_map.gripper
     if spec is None or not spec.fingers:
         return None
     values = episode.field(spec.fingers)
-    # Column by column: over so short an axis, max and min are several times slower.
-    with np.errstate(invalid="ignore", over="ignore"):  # whatever a broken sensor says
+    # Column by column, as max and min over so short an axis are several times slower.
+    with np.errstate(invalid="ignore", over="ignore"):  # a broken sensor may send anything
         spread: Floats = reduce(np.maximum, values.T) - reduce(np.minimum, values.T)
         if values.shape[1] == 1 or not np.any(spread):
             spread = values.sum(axis=1)
     return spread
 
 
-def _width_state(width: Floats) -> npt.NDArray[np.int8]:
+def width_state(width: Floats) -> npt.NDArray[np.int8]:
     """(T,) +1 open, -1 closed, 0 not known yet, by hysteresis on the width."""
     low, high = (float(width.min()), float(width.max())) if len(width) else (0.0, 0.0)
-    if not high - low > STILL_SHARE * abs(high):  # they never moved
+    if not high - low > STILL_SHARE * abs(high):  # the fingers never moved
         return np.zeros(len(width), dtype=np.int8)
     share = (width - low) / (high - low)
     sign = (share >= OPEN_SHARE).astype(np.int8) - (share <= CLOSED_SHARE).astype(np.int8)
     return _held(sign)
 
 
-def fingers_closed(episode: Episode) -> Mask | None:
-    """(T,) whether the fingers are together, as measured; None without fingers in the map."""
-    width = finger_width(episode)
-    if width is None:
-        return None
-    mask: Mask = _width_state(width) < 0
-    return mask
-
-
-def first_finger_opening(episode: Episode) -> int | None:
-    """First step with the fingers apart after they had been together, as measured."""
-    width = finger_width(episode)
-    return None if width is None else opening_of(_width_state(width))
-
-
 @once_per_episode
 def contradiction(episode: Episode) -> str | None:
-    """Whether the data contradict the declared meaning of the command, in one sentence.
+    """How the data contradict the declared meaning of the command, in one sentence.
 
-    Refused are continuous commands beyond the declared ends; binary ones of one sign only, which
-    could never both open and close, if what they do shows that both are meant; and a sign that
-    the fingers contradict. After each switch of the command the width is compared with that
-    SETTLE_S later (or at the next switch): it must shrink after a switch to closed and grow after
-    one to open. Fingers that do not move are no contradiction: they may be blocked, slow or not
-    measured.
+    Three things are contradictions:
+
+    - Continuous commands beyond the declared ends.
+    - Binary commands of one sign only, which could never both open and close, if their effect
+      shows that both are meant.
+    - A sign that the fingers contradict. After each switch of the command the width is compared
+      with the width FINGER_DELAY_S later, or at the next switch. It must shrink after a switch to
+      closed and grow after one to open.
+
+    Fingers that do not move are no contradiction: they may be blocked, slow or not measured.
 
     Returns:
-        The contradiction, or None where there is none or nothing to judge by.
+        The contradiction; None if there is none, or nothing to compare with.
 
     Raises:
         EpisodeError: if a field that the topic map declares is missing.
@@ -212,13 +208,12 @@ def _beyond_ends(command: Floats, spec: GripperSpec) -> str | None:
 def _one_sided(
     episode: Episode, command: Floats, width: Floats | None, spec: GripperSpec
 ) -> str | None:
-    known = np.where(np.isfinite(command), command, np.nan)  # compares false, so it holds
+    known = np.where(np.isfinite(command), command, np.nan)  # NaN holds the previous command
     is_positive = bool((known > 0).any())
     if is_positive == bool((known < 0).any()):
         return None
-    # One sign: by the map it can only ever open, or only close, and at 0 it holds. Switches
-    # between large and small commands that move the fingers the other way show that both are
-    # meant.
+    # By the map, commands of one sign can only open, or only close, and 0 holds. If a switch
+    # from large to small commands moves the fingers the other way, both were meant.
     wanted = spec.opens if is_positive else -spec.opens
     share = np.abs(known) / np.nanmax(np.abs(known))
     level = _held((share >= OPEN_SHARE).astype(np.int8) - (share <= CLOSED_SHARE).astype(np.int8))
@@ -232,10 +227,11 @@ def _one_sided(
         f"{'open' if wanted > 0 else 'close'}"
     )
     if width is None:
-        # Without fingers: it stays large, then small, each for longer than a press of a button.
-        settle_ns = int(SETTLE_S * NS_PER_S)
+        # Without fingers: the command stays large, then small, each for longer than a person
+        # presses a button by accident.
+        long_ns = int(FINGER_DELAY_S * NS_PER_S)
         edges = np.concatenate([[0], switches, [len(level) - 1]])
-        long = np.diff(episode.stamps_ns[edges]) >= settle_ns
+        long = np.diff(episode.stamps_ns[edges]) >= long_ns
         fell = level[switches] < 0
         if not (fell & long[:-1] & long[1:]).any():
             return None
@@ -272,12 +268,11 @@ def _inverted(episode: Episode, width: Floats, spec: GripperSpec) -> str | None:
 
 
 def _settled(episode: Episode, switches: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Step until which the fingers had time to follow each switch: SETTLE_S or the next one."""
+    """Step until which the fingers had time to follow each switch of the command."""
     stamps = episode.stamps_ns
-    deadline = (
-        np.searchsorted(stamps, stamps[switches] + int(SETTLE_S * NS_PER_S), side="right") - 1
-    )
-    ends: npt.NDArray[np.intp] = np.minimum(deadline, np.append(switches[1:], len(stamps) - 1))
+    deadline_ns = stamps[switches] + int(FINGER_DELAY_S * NS_PER_S)
+    last = np.searchsorted(stamps, deadline_ns, side="right") - 1
+    ends: npt.NDArray[np.intp] = np.minimum(last, np.append(switches[1:], len(stamps) - 1))
     return ends
 
 
@@ -293,10 +288,10 @@ def _distance(episode: Episode, moved: float) -> str:
 
 
 def gripper_findings(episode: Episode) -> tuple[Finding, ...]:
-    """The finding `gripper-meaning` where the data contradict the topic map, else nothing."""
+    """The finding `gripper-meaning` if the data contradict the topic map, else nothing."""
     try:
         text = contradiction(episode)
-    except EpisodeError:  # a missing field is the builder's finding, not ours
+    except EpisodeError:  # the builder has a finding for a missing field
         return ()
     if text is None:
         return ()

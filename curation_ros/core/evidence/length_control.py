@@ -1,7 +1,7 @@
-"""Length control: the one home of what is done about episodes of different length.
+"""Length control: the one module that makes episodes of different length comparable.
 
-Defective demonstrations often run to the time limit. A scorer that averages over the whole
-episode then measures length; truncating all to one prefix takes that away (seed paper, III-D).
+Defective demonstrations often run to the time limit. A scorer that averages over the complete
+episode then measures length. Cutting all episodes to one prefix removes that (seed paper, III-D).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from curation_ros.core.episode.episode import Episode
 
-#: mode -> what it does. The only list.
+#: Mode -> what it does. The only list.
 MODES: dict[str, str] = {
     "none": "whole episodes",
     "shortest-reference": "the prefix as long as the shortest reference episode (the paper's T)",
@@ -29,18 +29,18 @@ MODES: dict[str, str] = {
     "phase-normalised": "`value` steps of every phase (50 by default)",
 }
 PHASE_STEPS = 50
-#: Shorter episodes have no motion: no scorer scores them, and none of them is to set T.
+#: Shorter episodes have no motion: no scorer scores them, and they must not set T.
 _LEAST_STEPS = 2
 
 
 class LengthControl:
-    """Turns an episode into the one that scorers see; an episode shorter than that stays whole.
+    """Cuts an episode to the T steps that scorers see. A shorter episode stays whole.
 
-    T never comes from labels: only from the lengths of a trusted reference, from those of the
+    T never comes from labels. It comes from the lengths of a trusted reference, from those of the
     whole unlabelled dataset, or from the configuration.
 
     Attributes:
-        steps_: T after `fit`, None for whole episodes; steps a phase with `phase-normalised`.
+        steps_: T after `fit`; None for whole episodes; steps per phase with `phase-normalised`.
     """
 
     def __init__(self, mode: str = "none", value: float | None = None) -> None:
@@ -48,11 +48,11 @@ class LengthControl:
 
         Args:
             mode: one of MODES.
-            value: for `fixed` the number of steps, for `phase-normalised` the steps a phase, for
-                `percentile` a number from 0 to 100.
+            value: for `fixed` the number of steps, for `phase-normalised` the steps per phase,
+                for `percentile` a number from 0 to 100.
 
         Raises:
-            ConfigError: if the mode does not exist, or `value` does not suit it.
+            ConfigError: if the mode does not exist, or `value` does not fit it.
         """
         if mode not in MODES:
             raise ConfigError(f"length control {mode!r} is none of {', '.join(MODES)}")
@@ -77,7 +77,7 @@ class LengthControl:
 
     @property
     def needs_reference(self) -> bool:
-        """Whether T is to be learned, with `fit` or `fit_lengths`."""
+        """Whether T must be learned, with `fit` or `fit_lengths`."""
         return self.mode in ("shortest-reference", "percentile")
 
     def fit(self, episodes: Sequence[Episode]) -> Self:
@@ -98,7 +98,7 @@ class LengthControl:
     def fit_lengths(self, lengths: Sequence[int]) -> Self:
         """Learn T from lengths alone: of a reference, or of all episodes of a dataset.
 
-        Lengths below two steps are left out: nobody scores such an episode.
+        Lengths below two steps are left out, as such an episode is never scored.
 
         Args:
             lengths: steps of each episode, in any order.
@@ -119,11 +119,11 @@ class LengthControl:
         return self
 
     def apply(self, episode: Episode) -> Episode:
-        """What scorers see of an episode; id, name, window and findings stay.
+        """The part of an episode that scorers see; id, name, window and findings stay.
 
         Raises:
-            NotFittedError: if the mode learns T and has not.
-            EpisodeError: if phases are to be normalised and the episode has none.
+            NotFittedError: if the mode learns T and was not fitted.
+            EpisodeError: with `phase-normalised`, if the episode has no phases.
         """
         if not hasattr(self, "steps_"):
             raise NotFittedError(f"length control {self.mode!r} needs a reference: fit it first")
@@ -145,9 +145,9 @@ class LengthControl:
 def _phase_normalised(episode: Episode, n_steps: int) -> Episode:
     """An episode of `n_steps` steps of each of its phases, in the order of the topic map.
 
-    Each step is the nearest one of the recording, whole: nothing but stamps is interpolated. All
-    visits of a phase count as one, steps of unknown phase are left out, and a phase that the
-    episode lacks is absent. Stamps are true to the nanosecond as long as phases do not recur.
+    Each step is the nearest step of the recording; only stamps are interpolated. All visits of a
+    phase count as one. Steps of unknown phase are left out, and so is a phase that the episode
+    lacks. Stamps are exact to the nanosecond unless phases recur.
     """
     phase = episode.phase
     if phase is None:
@@ -164,7 +164,7 @@ def _phase_normalised(episode: Episode, n_steps: int) -> Episode:
             continue
         position = np.linspace(0, len(found) - 1, n_steps)
         steps.append(found[np.rint(position).astype(np.int64)])
-        # Interpolated from the phase's start: float64 holds an epoch only to some 100 ns.
+        # Relative to the start of the phase, as float64 holds an epoch to some 100 ns only.
         first = episode.stamps_ns[found[0]]
         since = episode.stamps_ns[found] - first
         stamps.append(first + np.rint(np.interp(position, range(len(found)), since)).astype(int))
@@ -174,7 +174,7 @@ def _phase_normalised(episode: Episode, n_steps: int) -> Episode:
             f"its {len(episode)} steps has a known one"
         )
     index = np.concatenate(steps)
-    # Recurring phases and phases of one step would make stamps repeat or go back.
+    # Phases that recur or have one step would make stamps repeat or go back.
     count = np.arange(len(index))
     stamps_ns = np.maximum.accumulate(np.concatenate(stamps) - count) + count
     stamps_ns = np.minimum(stamps_ns, episode.stamps_ns[-1] - count[::-1])

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from curation_ros.core.errors import ConfigError
-from curation_ros.core.evidence.carrying import Carrying
-from curation_ros.core.evidence.fingers import grip_of
+from curation_ros.core.evidence.fingers import held_by_fingers
+from curation_ros.core.evidence.holds import Carrying
 from curation_ros.core.scorers.features import checked_command
 from curation_ros.core.scorers.object_coupling import (
     known,
@@ -69,7 +69,7 @@ class GripConsistency(Scorer):
         """
         self.check_params()
         checked_command(episode)
-        carrying = known(episode, grip_of(episode, effort=self.effort))
+        carrying = known(episode, held_by_fingers(episode, effort=self.effort))
         return Look(
             carrying.coupling,
             steps=lost_steps(carrying),

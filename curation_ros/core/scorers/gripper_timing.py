@@ -99,10 +99,10 @@ class GripperTiming(Scorer):
             raise Abstain("the topic map declares no fingers")
         if not np.isfinite(width).all():
             raise Abstain("the fingers have values that are not finite")
-        closed = gripper.fingers_closed(episode)
-        if closed is None or not closed.any():
+        state = gripper.width_state(width)
+        if not (state < 0).any():
             raise Abstain("the fingers never closed")
-        return gripper.first_finger_opening(episode)
+        return gripper.opening_of(state)
 
 
 def _seconds(episode: Episode, step: int) -> float:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.evidence.carrying import Carrying, Hold, carry_labels, carrying_of
+from curation_ros.core.evidence.carrying import carrying_of
 from curation_ros.core.evidence.gripper import commanded
+from curation_ros.core.evidence.holds import Carrying, Hold, carry_labels
 from curation_ros.core.scorers.features import checked_command
 from curation_ros.core.scorers.scorer import Abstain, Look, Scorer
 from curation_ros.core.types import NS_PER_S

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from curation_ros.core.errors import ConfigError
-from curation_ros.core.evidence.carrying import carry_labels
+from curation_ros.core.evidence.holds import carry_labels
 from curation_ros.core.scorers.features import checked_command
 from curation_ros.core.scorers.object_coupling import seconds
 from curation_ros.core.scorers.scorer import Abstain, Look, Scorer

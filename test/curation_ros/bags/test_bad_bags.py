@@ -23,7 +23,8 @@ from curation_ros.cli.main import main
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.episode.findings import FINDINGS
 from curation_ros.core.errors import BagError, ConfigError, CurationError, EpisodeError
-from curation_ros.core.evidence.checks import Baseline, check_episode
+from curation_ros.core.evidence.baseline import Baseline
+from curation_ros.core.evidence.checks import check_episode
 from curation_ros.dataset.dataset import Dataset
 
 #: Of everything that reads one bad bag; a chunk of the largest size is not among them.

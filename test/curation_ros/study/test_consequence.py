@@ -11,7 +11,7 @@ import pytest
 from curation_ros.bags.reader import read_episode
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.evidence.carrying import carrying_of
-from curation_ros.core.evidence.fingers import grip_of
+from curation_ros.core.evidence.fingers import held_by_fingers
 from curation_ros.core.scorers import SCORERS
 from curation_ros.dataset.dataset import Dataset
 
@@ -87,7 +87,7 @@ def test_clean_ones_are_carried_although_the_bowl_tilts(
         assert abs(hold.slip_m) < 0.01
         assert hold.rise_ratio is not None
         assert 0.85 < hold.rise_ratio < 1.05
-        assert grip_of(episode).state == "carried"
+        assert held_by_fingers(episode).state == "carried"
         assert [SCORERS[name]().score(episode) for name in NAMES] == [1.0, 1.0, 1.0]
 
 
@@ -100,7 +100,7 @@ def test_drops_are_found_where_they_are(
     for episode in episodes[defect]:
         command = episode.fields["gripper"][:, 0]
         opened = int(np.flatnonzero((command < 0) & (episode.phase == _index(episode, phase)))[0])
-        for found in (carrying_of(episode), grip_of(episode)):
+        for found in (carrying_of(episode), held_by_fingers(episode)):
             [hold] = found.holds
             assert (hold.state, hold.phase, hold.opened) == ("broken", phase, True)
             assert hold.departed is not None
@@ -116,7 +116,7 @@ def test_missed_grasps_were_never_carried(episodes: dict[str, list[Episode]]) ->
     for episode in episodes["missed_grasp"]:
         assert carrying_of(episode).state == "never"
         # Its fingers are still closing when LIFT begins: it takes a few steps to see on what.
-        assert grip_of(episode).state in ("never", "broken")
+        assert held_by_fingers(episode).state in ("never", "broken")
         assert SCORERS["object_coupling"]().score(episode) == 0.0
         assert SCORERS["grip_consistency"]().score(episode) < 0.1
         # Commands alone do not show it.

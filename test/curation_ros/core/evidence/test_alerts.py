@@ -1,4 +1,4 @@
-"""What is said of an episode that grows is what is said of the whole one."""
+"""The alert of a running episode is that of the complete one, only sooner."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from scenes import (
 
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.findings import Finding
-from curation_ros.core.evidence.alerts import OPEN_S, AlertWatch
+from curation_ros.core.evidence.alerts import OPEN_S, AlertWatch, alerts_of
 from curation_ros.core.types import NS_PER_S
 
 LEFT = scene(is_taken=False, tremor_m=1e-5)
@@ -82,7 +82,7 @@ EPISODES: dict[str, tuple[Episode, str | None]] = {
     "lost in TRANSPORT": (scene(dropped_at=TRANSPORT_AT + 20), "object-lost"),
     "let go in TRANSPORT": (OPENED, "object-lost"),
     "left behind": (LEFT, "not-carried"),
-    # The first that goes wrong is told, live and afterwards.
+    # The first loss raises the alert, live and afterwards.
     "left behind, then lost": (one_after_the_other(LEFT, LOST), "not-carried"),
     "lost, then left behind": (one_after_the_other(LOST, LEFT), "object-lost"),
     # Without the pose of an object, by the gripper.
@@ -103,7 +103,7 @@ EPISODES: dict[str, tuple[Episode, str | None]] = {
     "never closed": (without(scene(opened_at=APPROACH), "object"), None),
     # What a command means must not be in doubt.
     "upside down": (without(upside_down(CARRIED), "object"), None),
-    # Where the data have a hole, nobody is alarmed by what is about it.
+    # A gap in the data raises no alert about what happened near it.
     "a gap at the loss": (silent(LOST, LIFT_AT + 10, LIFT_AT + 19), None),
     "a gap in the approach": (silent(LOST, 5, 15), "object-lost"),
     "a gap at the command": (silent(NO_OBJECT["let go"], OPENED_AT, OPENED_AT + 3), None),
@@ -111,19 +111,19 @@ EPISODES: dict[str, tuple[Episode, str | None]] = {
 
 
 @pytest.mark.parametrize("name", EPISODES)
-def test_told_once_and_the_same_as_of_the_whole(name: str) -> None:
+def test_alert_is_raised_once_and_is_that_of_the_complete_episode(name: str) -> None:
     episode, expected = EPISODES[name]
     watch = AlertWatch(episode.topic_map)
-    told = [watch.take(episode.steps(n)) for n in range(2, len(episode) + 1)]
-    [*found] = [finding for finding in told if finding is not None]
+    taken = [watch.take(episode.steps(n)) for n in range(2, len(episode) + 1)]
+    [*found] = [finding for finding in taken if finding is not None]
     assert [f.id for f in found] == ([] if expected is None else [expected])
     whole = AlertWatch(episode.topic_map).take(episode)
     assert found == ([] if whole is None else [whole])
 
 
 @pytest.mark.parametrize("name", [n for n, (_, expected) in EPISODES.items() if expected])
-def test_told_when_it_is_sure_and_soon(name: str) -> None:
-    """The end of its span is the step at which it is told; a step is 0.05 s."""
+def test_alert_is_raised_as_soon_as_it_is_certain(name: str) -> None:
+    """Its span ends at the step at which it is raised. A step takes 0.05 s."""
     episode, _ = EPISODES[name]
     watch = AlertWatch(episode.topic_map)
     for n in range(2, len(episode) + 1):
@@ -131,35 +131,34 @@ def test_told_when_it_is_sure_and_soon(name: str) -> None:
             assert finding.span[1] == episode.span(n - 1, n - 1)[0] or "jumps" in name
             assert finding.span[1] - finding.span[0] <= 0.3 * NS_PER_S
             return
-    raise AssertionError("it was not told")
+    raise AssertionError("no alert was raised")
 
 
-def test_what_it_says_of_the_gripper() -> None:
-    def told(name: str) -> Finding:
+def test_messages_about_the_gripper() -> None:
+    def alert(name: str) -> Finding:
         episode, _ = EPISODES[name]
         finding = AlertWatch(episode.topic_map).take(episode)
         assert finding is not None
         return finding
 
     at_s = OPENED_AT / 20
-    assert told("no object, no fingers, let go") == Finding(
+    assert alert("no object, no fingers, let go") == Finding(
         "opened-early",
         f"the gripper was commanded to open at {at_s:.2f} s in TRANSPORT",
         (round(at_s * NS_PER_S), round((at_s + OPEN_S) * NS_PER_S)),
     )
     # The fingers of the scene follow two steps behind the command.
-    assert told("no object, let go").message == (
+    assert alert("no object, let go").message == (
         f"the fingers had let go at {at_s + 0.1:.2f} s in TRANSPORT, as finger_position shows"
     )
 
 
-def test_what_trusted_episodes_show_is_not_told() -> None:
+def test_what_trusted_episodes_show_raises_no_alert() -> None:
     """A robot that throws: its object leaves in TRANSPORT, after a command to open."""
-    watch = AlertWatch(OPENED.topic_map)
-    assert {f.id for f in watch.all(OPENED)} == {"object-lost", "opened-early"}
+    assert {f.id for f in alerts_of(OPENED)} == {"object-lost", "opened-early"}
     usual = AlertWatch(OPENED.topic_map, usual=("object-lost", "opened-early"))
     assert usual.take(OPENED) is None
-    assert not usual.has_spoken
+    assert not usual.has_alerted
     only = AlertWatch(OPENED.topic_map, usual=("object-lost",)).take(OPENED)
     assert only is not None
     assert only.id == "opened-early"

@@ -22,8 +22,9 @@ from scenes import (
 )
 
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.evidence.carrying import Carrying, CarryWatch, Hold, carrying_of
+from curation_ros.core.evidence.carrying import CarryWatch, carrying_of
 from curation_ros.core.evidence.gripper import commanded
+from curation_ros.core.evidence.holds import Carrying, Hold
 
 N_CARRY = RELEASE_AT - LIFT_AT
 TREMOR_M = 1e-5
@@ -103,7 +104,7 @@ def test_object_that_slides_out_of_the_fingers_is_lost() -> None:
     assert hold.noticed < LIFT_AT + 45
 
 
-def test_what_settles_in_the_fingers_is_carried_and_the_slip_told() -> None:
+def test_object_that_settles_in_the_fingers_is_carried_and_its_slip_measured() -> None:
     settling = scene()
     bowl = settling.fields["bowl_position"].copy()
     bowl[:, 2] -= 0.0001 * np.clip(np.arange(N_STEPS) - LIFT_AT - 10, 0, 60)
@@ -253,7 +254,7 @@ def test_one_wild_pose_is_no_drop() -> None:
 
 
 def test_one_wild_pose_is_no_drop_after_the_gripper_had_opened_for_a_moment() -> None:
-    # 6 cm back up in one step is no motion either: then nobody knows.
+    # 6 cm back up in one step is no motion either: then the outcome is unknown.
     for far_m, state in ((0.03, "carried"), (0.06, "unknown"), (0.3, "carried")):
         made = scene(tremor_m=TREMOR_M)
         command = made.fields["gripper"].copy()
@@ -283,7 +284,7 @@ def unknown(episode: Episode) -> str:
     return carrying.worst.reason if carrying.worst is not None else carrying.reason
 
 
-def test_object_that_nobody_publishes() -> None:
+def test_object_without_a_publisher() -> None:
     made = scene()
     gone = np.full((N_STEPS, 3), np.nan)
     both = with_fields(made, bowl_position=gone, plate_position=gone)
@@ -315,7 +316,7 @@ def frozen(first: int, last: int, **made: int) -> Episode:
 def test_pose_that_freezes() -> None:
     text = "no new pose of bowl_position for 0.5 s from 3.45 s on, while the effector moved"
     assert unknown(frozen(70, N_STEPS - 1)) == text
-    assert unknown(frozen(70, 100, dropped_at=80)) == text  # it was lost, nobody knows when
+    assert unknown(frozen(70, 100, dropped_at=80)) == text  # it was lost at an unknown time
     assert only_hold(frozen(70, 100)).state == "carried"  # back again, and still in the hand
     assert only_hold(frozen(70, 78)).state == "carried"
     assert only_hold(frozen(100, N_STEPS - 1, dropped_at=80)).state == "broken"

@@ -11,14 +11,14 @@ from scenes import HELD_M, LIFT_AT, N_STEPS, OPEN_M, RELEASE_AT, TRANSPORT_AT, s
 
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import FieldSpec
-from curation_ros.core.evidence.carrying import Hold
-from curation_ros.core.evidence.fingers import grip_of
+from curation_ros.core.evidence.fingers import held_by_fingers
+from curation_ros.core.evidence.holds import Hold
 
 N_CARRY = RELEASE_AT - LIFT_AT
 
 
 def only_hold(episode: Episode, effort: str = "") -> Hold:
-    [hold] = grip_of(episode, effort=effort).holds
+    [hold] = held_by_fingers(episode, effort=effort).holds
     return hold
 
 
@@ -79,7 +79,7 @@ def test_fingers_that_closed_on_nothing_never_held() -> None:
     made = scene()
     empty = np.where(widths(made) < 0.01, 0.001, widths(made))
     assert only_hold(with_width(made, empty)).state == "never"
-    assert grip_of(with_width(made, empty)).coupling == 0.0
+    assert held_by_fingers(with_width(made, empty)).coupling == 0.0
 
 
 def test_fingers_that_close_further_as_the_object_turns_still_hold() -> None:
@@ -99,7 +99,7 @@ def test_one_wild_width_is_no_loss() -> None:
 
 
 def test_what_follows_the_release_changes_nothing() -> None:
-    assert grip_of(scene()) == grip_of(scene(hover=200))
+    assert held_by_fingers(scene()) == held_by_fingers(scene(hover=200))
 
 
 @pytest.mark.parametrize("opened_at", [LIFT_AT + 30, TRANSPORT_AT + 5, RELEASE_AT])
@@ -107,7 +107,7 @@ def test_growing_episode_gives_the_same_answer(opened_at: int) -> None:
     made = scene(opened_at=opened_at)
     whole = only_hold(made)
     for stop in range(LIFT_AT + 1, N_STEPS):
-        [hold] = grip_of(made.steps(stop)).holds
+        [hold] = held_by_fingers(made.steps(stop)).holds
         is_known = whole.noticed is not None and stop > whole.noticed
         assert (hold.state == "broken") == is_known
         if is_known:
@@ -116,18 +116,18 @@ def test_growing_episode_gives_the_same_answer(opened_at: int) -> None:
 
 def test_what_cannot_be_known() -> None:
     made = scene()
-    [hold] = grip_of(scene(tail=LIFT_AT + 10)).holds
+    [hold] = held_by_fingers(scene(tail=LIFT_AT + 10)).holds
     assert (hold.state, hold.reason) == ("unknown", "it ends in LIFT")
-    assert grip_of(scene(tail=LIFT_AT)).reason == "it never came to LIFT or TRANSPORT"
+    assert held_by_fingers(scene(tail=LIFT_AT)).reason == "it never came to LIFT or TRANSPORT"
     no_fingers = replace(
         made,
         topic_map=replace(made.topic_map, gripper=replace(made.topic_map.gripper, fingers="")),  # type: ignore[type-var]
     )
-    assert grip_of(no_fingers).reason == "the topic map declares no fingers"
+    assert held_by_fingers(no_fingers).reason == "the topic map declares no fingers"
     gone = with_width(made, np.full(N_STEPS, np.nan))
     assert only_hold(gone).reason == "no value of finger_position"
-    assert grip_of(made, effort="effort").reason.startswith("no field 'effort'")
-    assert grip_of(without(made, "gripper", "phase")).state == "unknown"
+    assert held_by_fingers(made, effort="effort").reason.startswith("no field 'effort'")
+    assert held_by_fingers(without(made, "gripper", "phase")).state == "unknown"
 
 
 def test_steps_of_unknown_phase_end_no_grip() -> None:

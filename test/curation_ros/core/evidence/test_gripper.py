@@ -16,11 +16,12 @@ from curation_ros.core.errors import EpisodeError
 from curation_ros.core.evidence.gripper import (
     contradiction,
     finger_width,
-    first_finger_opening,
     first_opening,
     gripper_findings,
     is_closed_command,
     is_open_command,
+    opening_of,
+    width_state,
 )
 
 
@@ -30,6 +31,12 @@ def commanded(*command: float, **spec: object) -> Episode:
     gripper = replace(topic_map().gripper or GripperSpec("gripper"), **spec)  # type: ignore[arg-type]
     episode = with_fields(episode, gripper=np.array(command, dtype=float)[:, None])
     return replace(episode, topic_map=replace(topic_map(), gripper=gripper))
+
+
+def finger_opening(episode: Episode) -> int | None:
+    width = finger_width(episode)
+    assert width is not None
+    return opening_of(width_state(width))
 
 
 def test_zero_holds_the_previous_command() -> None:
@@ -84,8 +91,8 @@ def test_finger_width_of_two_one_and_mimic_columns() -> None:
 
 
 def test_fingers_follow_after_their_lag(rng: np.random.Generator) -> None:
-    assert first_finger_opening(make_episode(rng, open_at=140, finger_lag=3)) == 143
-    assert first_finger_opening(make_episode(rng, close_at=None)) is None
+    assert finger_opening(make_episode(rng, open_at=140, finger_lag=3)) == 143
+    assert finger_opening(make_episode(rng, close_at=None)) is None
 
 
 @pytest.mark.parametrize("open_at", [-1, 140, None])
@@ -131,7 +138,7 @@ def test_fingers_that_do_not_move_are_no_contradiction(rng: np.random.Generator)
 
 
 def recoded(episode: Episode, opened: float, closed: float, **spec: object) -> Episode:
-    """The same motion of the gripper, told with other numbers, under a map with `spec` changed."""
+    """The same motion with other numbers, under a map with `spec` changed."""
     is_open = episode.fields["gripper"] < 0
     gripper = replace(topic_map().gripper or GripperSpec("gripper"), **spec)  # type: ignore[arg-type]
     episode = with_fields(episode, gripper=np.where(is_open, opened, closed))
@@ -217,7 +224,7 @@ def test_fingers_that_obey_the_declared_meaning_never_contradict_it(
 ) -> None:
     ends = {"opens": opens, "open_value": float(opens), "closed_value": -float(opens)}
     episode = commanded(*command, **ends)
-    # Open until told otherwise.
+    # Open until the first command to close.
     wide = ~is_closed_command(episode)[np.maximum(np.arange(len(command)) - lag, 0)]
     fingers = np.outer(np.where(wide, 0.04, 0.004), [1.0, -1.0])
     assert contradiction(with_fields(episode, finger_position=fingers)) is None

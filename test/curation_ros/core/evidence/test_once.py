@@ -13,9 +13,10 @@ from episodes import make_episode, with_fields
 
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.evidence.carrying import carry_steps, carrying_of
-from curation_ros.core.evidence.fingers import grip_of
+from curation_ros.core.evidence.carrying import carrying_of
+from curation_ros.core.evidence.fingers import held_by_fingers
 from curation_ros.core.evidence.gripper import commanded, finger_width
+from curation_ros.core.evidence.holds import carry_steps
 from curation_ros.core.evidence.once import once_per_episode
 
 
@@ -61,7 +62,7 @@ def test_nothing_that_was_computed_travels_to_another_process() -> None:
     episode = make_episode()
     size = len(pickle.dumps(episode))
     carrying_of(episode)
-    grip_of(episode)
+    held_by_fingers(episode)
     assert len(pickle.dumps(episode)) == size
     assert carrying_of(pickle.loads(pickle.dumps(episode))) == carrying_of(episode)
 
