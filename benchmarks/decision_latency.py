@@ -24,6 +24,7 @@ from curation_ros.core.episode.identity import new_episode_id
 from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.core.episode.stream import playback_order
 from curation_ros.core.types import NS_PER_S
+from curation_ros.dataset.dataset import Dataset
 from curation_ros.nodes.messages import status_from_ros
 from curation_ros.nodes.processes import Domain, Nodes
 from curation_ros.nodes.qos import EVENTS
@@ -51,7 +52,7 @@ def run() -> list[dict[str, Any]]:
         reference = record(folder / "reference", episodes=6, seed=101)
         source = record(folder / "source", episodes=5, seed=7, contamination=1.0)
         topic_map = topic_map_or_default("")
-        bags = [open_bag(path) for path in sorted((source / "episodes").glob("0*"))]
+        bags = [open_bag(path) for path in Dataset(source).bags()]
         episodes = [(bag.event(), playback_order(bag.samples(topic_map))) for bag in bags]
         domain = Domain()
         inside: list[float] = []

@@ -72,7 +72,7 @@ def run() -> list[dict[str, Any]]:
 
 def _first_episode(dataset: Path) -> float:
     """Wait for the first episode to end; start-up is another figure."""
-    while not (dataset / "truth.jsonl").exists():
+    while not Dataset(dataset, create=True).truth_log.path.exists():
         time.sleep(0.02)
     return time.monotonic()
 

@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from curation_ros.dataset.dataset import Dataset
 from curation_ros.nodes.processes import Domain, Nodes
 
 _CONTAMINATED: dict[str, Any] = {"episodes": 80, "contamination": 0.8, "defect": "early_release"}
@@ -27,7 +28,7 @@ _PATIENCE_S = 3600.0
 
 def record(folder: Path, parameters: dict[str, Any]) -> Path:
     """Record one dataset, if it is not there; returns its folder."""
-    if (folder / "truth.jsonl").exists():
+    if Dataset(folder, create=True).truth_log.lines():
         return folder
     domain = Domain()
     with Nodes(domain, folder / "logs") as nodes:

@@ -15,6 +15,7 @@ import streams
 import yaml
 
 from curation_ros.bags.reader import open_bag
+from curation_ros.dataset.dataset import Dataset
 from curation_ros.nodes.processes import Domain, Nodes
 
 COMMAND = "python benchmarks/run.py recorder_loss"
@@ -42,7 +43,7 @@ def run(seconds: float = SECONDS) -> list[dict[str, Any]]:
             sender = resource.getrusage(resource.RUSAGE_CHILDREN)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         sent = json.loads(done.stdout.splitlines()[-1])
-        bag = open_bag(folder / "data" / "episodes" / sent["episode"])
+        bag = open_bag(Dataset(folder / "data").bag_path(sent["episode"]))
         kept = sum(topic.count for topic in bag.topics.values())
     domain.close()
     assert before.ru_utime <= sender.ru_utime

@@ -1,7 +1,11 @@
-"""Files that survive a crash: whole or absent, locked, and appended line by line."""
+"""Files that survive a crash: atomic writes, locks between processes, and logs of JSON lines.
+
+No other module imports fcntl or syncs a file on its own.
+"""
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -9,9 +13,29 @@ import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import IO, Any
 
 from curation_ros.core.errors import CurationError
+
+
+@contextmanager
+def named_errors(path: Path) -> Iterator[None]:
+    """Turn an error of the system into one of ours that names the file.
+
+    Args:
+        path: named where the system's error names no file.
+
+    Raises:
+        CurationError: for each OSError.
+    """
+    try:
+        yield
+    except OSError as err:
+        raise CurationError(f"{err.filename or path}: {err.strerror or err}") from err
+
+
+# --- atomic writes ------------------------------------------------------------------------------
 
 
 def sync_folder(folder: Path) -> None:
@@ -27,18 +51,36 @@ def sync_folder(folder: Path) -> None:
         os.close(fd)
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Write a whole file or nothing, and have it on disk when this returns."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Not tempfile's: its files are for their owner's eyes alone.
+def write_atomically(
+    path: Path, content: str | bytes, *, replace: bool = True, make_folder: bool = True
+) -> None:
+    """Write a whole file or nothing; it is on the disk when this returns.
+
+    Args:
+        path: the file.
+        content: text is written as UTF-8.
+        replace: whether a file that exists is replaced.
+        make_folder: whether its folder is made where it does not exist.
+
+    Raises:
+        FileExistsError: if the file exists and must not be replaced.
+        OSError: if it cannot be written.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    if make_folder:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    # Not a file of `tempfile`: only its owner could read it.
     name = path.parent / f".{path.name}.{uuid.uuid4().hex}"
-    handle = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    fd = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
-        with os.fdopen(handle, "w") as out:
-            out.write(text)
+        with os.fdopen(fd, "wb") as out:
+            out.write(data)
             out.flush()
             os.fsync(out.fileno())
-        os.replace(name, path)
+        if replace:
+            os.replace(name, path)
+        else:
+            _rename_to_new(name, path)
     except BaseException:
         with suppress(OSError):
             os.unlink(name)
@@ -46,41 +88,127 @@ def write_atomically(path: Path, text: str) -> None:
     sync_folder(path.parent)
 
 
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Hold the lock file of a folder against other processes and threads."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
-
-
-@contextmanager
-def named_errors(path: Path) -> Iterator[None]:
-    """What the system refuses becomes an error for people, with the file's name."""
+def _rename_to_new(name: Path, path: Path) -> None:
+    """Rename a file to a name that does not exist; of several processes, one succeeds."""
+    exists = FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
     try:
-        yield
-    except OSError as err:
-        raise CurationError(f"{err.filename or path}: {err.strerror or err}") from err
+        os.link(name, path)  # a rename would replace the file
+    except FileExistsError:
+        raise exists from None
+    except OSError:  # a file system without hard links
+        if path.exists():
+            raise exists from None
+        os.rename(name, path)
+    else:
+        os.unlink(name)
+
+
+# --- locks --------------------------------------------------------------------------------------
+
+
+class FileLock:
+    """A lock on a file, held until `release`, the end of a `with`, or the end of the process."""
+
+    def __init__(self, file: IO[str]) -> None:
+        """Take over a file that is locked; `exclusive` and `try_lock` make locks."""
+        self._file = file
+
+    def release(self) -> None:
+        """Let others have the lock; a second call changes nothing."""
+        self._file.close()
+
+    def __enter__(self) -> FileLock:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.release()
+
+
+def exclusive(path: Path) -> FileLock:
+    """Wait for the lock on a file, against other processes and threads.
+
+    Args:
+        path: the lock's file; it and its folder are made where they do not exist, and stay.
+
+    Raises:
+        OSError: if it cannot be opened.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = path.open("a")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX)
+    except BaseException:
+        file.close()
+        raise
+    return FileLock(file)
+
+
+def try_lock(path: Path) -> FileLock | None:
+    """Take the lock on a file if it is free.
+
+    Args:
+        path: the lock's file in a folder that exists; the file is made where it does not exist.
+
+    Returns:
+        The lock; None while another process or thread has it.
+
+    Raises:
+        OSError: if the file cannot be opened.
+    """
+    file = path.open("a")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        return None
+    return FileLock(file)
+
+
+# --- JSON lines ---------------------------------------------------------------------------------
 
 
 def append_line(path: Path, record: Mapping[str, Any]) -> None:
-    """Append one JSON line and sync it; a torn last line (a crash) is ended first."""
+    """Append one JSON line; it is on the disk when this returns.
+
+    A torn last line, left by a crash, is ended first.
+
+    Args:
+        path: the log; it and its folder are made where they do not exist.
+        record: JSON values; NaN and infinity are refused.
+
+    Raises:
+        OSError: if the line cannot be written.
+        ValueError: if the record is not JSON.
+    """
+    line = json.dumps(record, allow_nan=False).encode() + b"\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+b") as out:
-        fcntl.flock(out, fcntl.LOCK_EX)  # half of another's line would look like a torn one
+        # Without the lock, half of another process's line would look like a torn one.
+        fcntl.flock(out, fcntl.LOCK_EX)
         end = out.seek(0, os.SEEK_END)
         if end:
             out.seek(end - 1)
             if out.read(1) != b"\n":
                 out.write(b"\n")
-        out.write(json.dumps(record, allow_nan=False).encode() + b"\n")
+        out.write(line)
         out.flush()
         os.fsync(out.fileno())
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """Whole JSON lines of a log; a torn line is skipped, a missing file is empty."""
+    """Read the whole lines of a log.
+
+    Returns:
+        The records, oldest first. Torn lines are skipped; a log that does not exist is empty.
+
+    Raises:
+        CurationError: if the log cannot be read.
+    """
     try:
         with named_errors(path):
             lines = path.read_bytes().splitlines()

@@ -22,6 +22,7 @@ import mujoco
 import numpy as np
 
 from curation_ros.core.errors import SimError
+from curation_ros.files import write_atomically
 from sim_node import quiet_libero
 
 _LOGGER = logging.getLogger(__name__)
@@ -105,7 +106,7 @@ def load_task() -> CompiledTask:
     _LOGGER.info("compiling the task for the first time (about 15 s); it is cached in %s", file)
     content = _to_bytes(*compile_task(quiet_libero.build_stock_environment(FIXTURE_SEED)))
     try:
-        quiet_libero.write_atomically(file, content)
+        write_atomically(file, content)
     except OSError as error:
         _LOGGER.warning("the compiled task cannot be kept in %s: %s", file, error)
     return _from_bytes(content)

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from curation_ros.core.errors import SimError
+from curation_ros.files import write_atomically
 
 _LOGGER = logging.getLogger(__name__)
 _IMPORT_LOCK = threading.Lock()
@@ -51,20 +52,6 @@ def cache_directory() -> Path:
         _LOGGER.warning("cache %s cannot be written (%s): using %s", folder, error, fallback)
         return fallback
     return folder
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that a reader, or a second writer, never sees half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
-            stream.write(content)
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
 
 
 def libero_root() -> Path:
@@ -169,7 +156,7 @@ def _point_libero_at_our_configuration() -> None:
     folder = cache_directory() / f"libero-{key}"
     file = folder / "config.yaml"
     if not file.is_file():
-        write_atomically(file, content.encode())
+        write_atomically(file, content)
     os.environ["LIBERO_CONFIG_PATH"] = str(folder)
 
 

@@ -40,18 +40,23 @@ class RecoveryReport:
 
 
 def recover_bag(
-    source: Path, target_dir: Path, custom_data: Mapping[str, str] | None = None
+    source: Path,
+    target_dir: Path,
+    custom_data: Mapping[str, str] | None = None,
+    *,
+    scratch: Path | None = None,
 ) -> RecoveryReport:
     """Copy every complete message of an interrupted bag into a new one.
 
-    The new bag appears at `target_dir` in one step, when it is whole; until then it is
-    `<target_dir's parent>/.partial/<its name>.recovering`.
+    The new bag appears at `target_dir` in one step, when it is whole.
 
     Args:
         source: folder of the interrupted bag, or its .mcap file.
         target_dir: folder of the new bag; must not exist.
         custom_data: added to that of the interrupted bag, beside `recovered` (`true`),
             `recovered_messages` (a number) and `recovered_tail` (why reading stopped).
+        scratch: where the new bag grows, on the file system of `target_dir`; None: a hidden folder
+            beside it. What an interrupted recovery has left there is removed.
 
     Raises:
         BagError: if there is nothing to recover, the target exists, or the disk fails.
@@ -59,7 +64,7 @@ def recover_bag(
     path = _only_mcap(source)
     if target_dir.exists():
         raise BagError(f"{target_dir} exists already; a bag is never overwritten")
-    scratch = target_dir.parent / ".partial" / f"{target_dir.name}.recovering"
+    scratch = scratch or target_dir.with_name(f".{target_dir.name}.recovering")
     # What an interrupted recovery has left is a copy; the original is still there.
     shutil.rmtree(scratch, ignore_errors=True)
     try:

@@ -19,7 +19,7 @@ from curation_ros.bags.qos import QosProfile, qos_to_yaml
 from curation_ros.bags.schemas import MessageSchema, message_schema
 from curation_ros.bags.yaml_text import dump_yaml
 from curation_ros.core.errors import BagError
-from curation_ros.files import sync_folder
+from curation_ros.files import write_atomically
 from curation_ros.version import __version__
 
 #: Bytes of messages after which a chunk is written without being asked to flush.
@@ -320,14 +320,8 @@ class BagWriter:
         )
 
     def _write_metadata_file(self, content: bytes) -> None:
-        final = self.directory / "metadata.yaml"
-        temporary = final.with_name("metadata.yaml.tmp")
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(final)
-        sync_folder(self.directory)
+        # A folder that vanished while the bag was written took the messages with it.
+        write_atomically(self.directory / "metadata.yaml", content, make_folder=False)
 
 
 def own_metadata(

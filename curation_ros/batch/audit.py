@@ -186,7 +186,7 @@ def audit(
     controlled = _fitted(settings, control, trusted, everything)
     lengths = np.array([len(e) for e in judged], dtype=np.float64)
     identifiable = not length_confound.separates(lengths, good)
-    noted = dataset.start_of()
+    noted = dataset.truth_log.starts()
     starts = [_start(noted.get(e.id), e.id) for e in judged]
     other = "defect" if settings.labels == "success" else "success"
     others = read_labels(dataset, other)

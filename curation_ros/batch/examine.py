@@ -7,7 +7,6 @@ hash of both. What rules and decisions make of it costs next to nothing.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -26,6 +25,7 @@ from curation_ros.core.episode.findings import Finding
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import CurationError
 from curation_ros.dataset.index import Index
+from curation_ros.dataset.layout import home_of
 from curation_ros.version import __version__
 
 # Bags that a worker gets at once: a fitted curation of some 100 kB goes with them.
@@ -111,13 +111,13 @@ class Examiner:
             ) from err
 
     def _keep(self, batch: Sequence[Examined], stamps: Mapping[Path, str]) -> None:
-        fresh = [e for e in batch if not e.is_known and isinstance(e.result, Examination)]
-        by_index: dict[Path, list[Examined]] = {}
-        for one in fresh:
-            by_index.setdefault(_home(one.path)[0], []).append(one)
-        for folder, found in by_index.items():
+        fresh = {
+            e.path: e.result for e in batch if not e.is_known and isinstance(e.result, Examination)
+        }
+        for some in _by_folder(fresh):
+            found = {bag: fresh[bag] for bag in some}
             try:
-                self._task.index(folder).keep(self._task, found, stamps)
+                Index.covering(some[0]).keep_examinations(self._task.key, found, stamps)
             except CurationError as err:
                 self.problem = str(err)
 
@@ -137,12 +137,10 @@ class _Task:
         stamps = {bag: _stamp(bag) for bag in bags}
         known: dict[Path, Examination] = {}
         if not fresh:
-            by_index: dict[Path, list[Path]] = {}
-            for bag in bags:
-                by_index.setdefault(_home(bag)[0], []).append(bag)
-            for folder, some in by_index.items():
-                with suppress(CurationError):  # no index, or one that is busy: work it out again
-                    known |= self.index(folder).look_up(self.key, some, stamps)
+            for some in _by_folder(bags):
+                with suppress(CurationError):  # no index, or a busy one: work it out again
+                    index = Index.covering(some[0])
+                    known |= index.examinations(self.key, {bag: stamps[bag] for bag in some})
         results = []
         for bag in bags:
             if bag in known:
@@ -155,70 +153,19 @@ class _Task:
                 results.append(Examined(bag, err, is_known=False))
         return results, stamps
 
-    @staticmethod
-    def index(folder: Path) -> _Kept:
-        return _Kept(Index(folder, is_dataset=(folder / "episodes").is_dir()))
 
-
-class _Kept:
-    """The examinations in an index."""
-
-    def __init__(self, index: Index) -> None:
-        self._index = index
-
-    def look_up(
-        self, key: str, bags: Sequence[Path], stamps: Mapping[Path, str]
-    ) -> dict[Path, Examination]:
-        """What is known of bags that have not changed since."""
-        if not self._index.path.exists():
-            return {}
-        names = {_home(bag)[1]: bag for bag in bags}
-        marks = ",".join("?" * len(names))
-        with self._index.transaction() as db:
-            rows = db.execute(
-                "SELECT bag, stamp, result FROM examinations "
-                f"WHERE scoring_hash = ? AND bag IN ({marks})",
-                (key, *names),
-            ).fetchall()
-        found = {}
-        for name, stamp, text in rows:
-            bag = names[name]
-            if stamp and stamp == stamps[bag]:
-                with suppress(CurationError, ValueError):
-                    found[bag] = Examination.from_json(json.loads(text))
-        return found
-
-    def keep(self, task: _Task, found: Sequence[Examined], stamps: Mapping[Path, str]) -> None:
-        rows, scores = [], []
-        by = task.curation.scoring_hash
-        for one in found:
-            if not isinstance(one.result, Examination):
-                continue
-            seen = one.result
-            text = json.dumps(seen.to_json(), allow_nan=False)
-            rows.append((_home(one.path)[1], task.key, stamps[one.path], text))
-            scores += [
-                (seen.episode, scorer, by, value, seen.abstained.get(scorer))
-                for scorer, value in seen.scores.items()
-            ]
-        with self._index.transaction() as db:
-            db.executemany("INSERT OR REPLACE INTO examinations VALUES (?,?,?,?)", rows)
-            db.executemany("INSERT OR REPLACE INTO scores VALUES (?,?,?,?,?)", scores)
+def _by_folder(bags: Iterable[Path]) -> list[list[Path]]:
+    """Bags side by side that one index covers."""
+    grouped: dict[Path, list[Path]] = {}
+    for bag in bags:
+        grouped.setdefault(home_of(bag)[0], []).append(bag)
+    return list(grouped.values())
 
 
 def _key(curation: Curation, topic_map: TopicMap | None) -> str:
     """Under which an examination is kept: another version of ours may see other things."""
     by = "" if topic_map is None else f"+{topic_map.hash}"
     return f"{__version__}+{curation.scoring_hash}{by}"
-
-
-def _home(bag: Path) -> tuple[Path, str]:
-    """Folder whose index has a bag (its dataset, or the folder around it), and its name there."""
-    folder = bag.resolve().parent
-    name = os.fsencode(bag.name).decode(errors="backslashreplace")  # SQLite takes UTF-8 alone
-    if folder.name == "episodes":
-        return folder.parent, f"episodes/{name}"
-    return folder, name
 
 
 def _stamp(bag: Path) -> str:

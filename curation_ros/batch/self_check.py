@@ -25,6 +25,7 @@ from curation_ros.core.decision.examination import Examination
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import CurationError
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.layout import is_dataset
 from curation_ros.files import write_atomically
 
 #: Keys of truth.jsonl that say which episode it is, not how it went: start states order equal
@@ -140,7 +141,7 @@ def _copies(dataset: Dataset, reference: Sequence[Path], home: Path, *, turn: bo
     counts = [_copy(dataset, target, turn=turn)]
     trusted = []
     for k, path in enumerate(reference):
-        if not (path / "episodes").is_dir():
+        if not is_dataset(path):
             trusted.append(path)
             continue
         copied = Dataset(home / f"reference-{k}", create=True)
@@ -161,14 +162,13 @@ def _copy(source: Dataset, target: Dataset, *, turn: bool) -> tuple[int, int]:
     labels = sum(len(set(record) - set(IDENTITY)) for record in truth.values())
     records = [turned(r) if turn else r for r in truth.values()]
     if records:
-        text = "".join(json.dumps(r) + "\n" for r in records)
-        write_atomically(target.path / "truth.jsonl", text)
+        target.truth_log.replace(records)
     overrides = 0
-    for log in sorted((source.path / "decisions").glob("*.jsonl")):
-        decisions = source.decisions(log.stem)
+    for episode_id in source.decided_ids():
+        decisions = source.decisions(episode_id)
         overrides += sum(d.by != CURATOR for d in decisions)
         lines = [(_turned_decision(d) if turn else d).to_line() + "\n" for d in decisions]
-        write_atomically(target.decision_log(log.stem), "".join(lines))
+        write_atomically(target.decision_log(episode_id), "".join(lines))
     return labels, overrides
 
 

@@ -369,10 +369,11 @@ class _Demo:
             if first in results:
                 console.print(_compared(first, second, results))
         seen = f"picture    {self.pictures[0]} (and .svg)\n" if self.pictures else ""
+        dataset = Dataset(self.dataset)
         console.print(
             f"\n{seen}"
-            f"bags       {self.dataset}/episodes\nindex      {self.dataset}/index.sqlite\n"
-            f"decisions  {self.dataset}/decisions\nnode logs  {self.logs}\n"
+            f"bags       {dataset.episodes_folder}\nindex      {dataset.index.path}\n"
+            f"decisions  {dataset.decisions_folder}\nnode logs  {self.logs}\n"
             f"took       {seconds / 60:.1f} minutes\n\n"
             "Next:\n"
             f"  .venv/bin/curation index {self.dataset}\n"

@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("dataset", type=Path)
     parser.add_argument(
-        "--rebuild", action="store_true", help="make the index anew from bags, logs and manifests"
+        "--rebuild", action="store_true", help="make the index anew from bags and decision logs"
     )
 
 
@@ -34,27 +34,27 @@ def run(args: argparse.Namespace) -> int:
         table.add_column(heading, no_wrap=True)
     table.add_column("seconds", justify="right")
     table.add_column("reason", ratio=1)
-    for row in dataset.rows("SELECT * FROM episodes ORDER BY id"):
-        decision = decided.get(row["id"])
+    for episode in dataset.index.episodes():
+        decision = decided.get(episode.id)
         verdict = decision.verdict if decision is not None else None
         by = decision.by if decision is not None else None
         reason = decision.reason if decision is not None else ""
-        seconds = (row["end_ns"] - row["start_ns"]) / NS_PER_S
+        seconds = episode.duration_ns / NS_PER_S
         if args.json:
             print_json(
                 {
-                    "episode": row["id"],
-                    "name": row["name"],
-                    "path": str(dataset.path / row["path"]),
+                    "episode": episode.id,
+                    "name": episode.name,
+                    "path": str(dataset.path / episode.path),
                     "decision": verdict,
                     "by": by,
                     "reason": reason,
-                    "recovered": bool(row["recovered"]),
+                    "recovered": episode.is_recovered,
                 }
             )
         else:
             shown = Text(verdict or "undecided", VERDICT_STYLE.get(verdict or "", "dim"))
-            name = Text(row["name"] or row["id"][:8])
+            name = Text(episode.name or episode.id[:8])
             table.add_row(name, shown, Text(by or ""), f"{seconds:.1f}", Text(reason))
     if not args.json:
         console.print(table)

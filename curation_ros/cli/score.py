@@ -29,6 +29,7 @@ from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.scorers import SCORERS
 from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.layout import home_of, is_dataset
 from curation_ros.live.curator import log_decision
 
 _DONE, _FINDINGS, _NOTHING = 0, 1, 3
@@ -175,10 +176,11 @@ def _logged(dataset: Dataset, path: Path, decision: Decision) -> Decision:
 
 def _overruled_by(path: Path, decision: Decision) -> str:
     """What a person has decided in the dataset of a bag, where that is another verdict."""
-    if path.parent.name != "episodes" or path.name != decision.episode:
+    folder, _ = home_of(path)
+    if not is_dataset(folder) or path.name != decision.episode:
         return ""
     with suppress(CurationError):
-        logged = Dataset(path.parent.parent).decisions(decision.episode)
+        logged = Dataset(folder).decisions(decision.episode)
         held = in_force(logged).get(decision.episode)
         if held is not None and held.by != CURATOR and held.verdict != decision.verdict:
             return f"{held.verdict}, by {held.by}"

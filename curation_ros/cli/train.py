@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
             progress=show,
         )
     policy = trained.policy
-    folder = policy.save(args.out or dataset.path / "policies" / policy.id)
+    folder = policy.save(args.out or dataset.policy_path(policy.id))
     row = {
         "policy": str(folder),
         "loss": trained.loss,

@@ -1,17 +1,15 @@
 """A dataset on disk: bags, decision logs, truth, manifests, and an SQLite index made from them.
 
-The files are the truth; the index is a cache that `rebuild` makes again from them. Who writes
-what: the recorder `episodes/`, the curator and the command line `decisions/`, the sim node (or
-the recording person) `truth.jsonl`.
+The files are the truth, and the index is a cache that `rebuild` makes again from them. The
+recorder writes `episodes/`, the curator and the command line write `decisions/`, and the sim node
+or the recording person writes `truth.jsonl`.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -22,14 +20,17 @@ from curation_ros.core.decision.decision import Decision, in_force
 from curation_ros.core.decision.manifest import Manifest
 from curation_ros.core.decision.ties import TieKey, tie_key
 from curation_ros.core.episode.identity import resolve_prefix
-from curation_ros.core.errors import BagError, CurationError, EpisodeError
-from curation_ros.dataset.index import TABLES, Index, SpoiltIndexError
+from curation_ros.core.errors import CurationError, EpisodeError
+from curation_ros.dataset import layout
+from curation_ros.dataset.index import Index, IndexedEpisode, SpoiltIndexError
+from curation_ros.dataset.partials import PartialBags
+from curation_ros.dataset.truth import TruthLog
 from curation_ros.files import (
     append_line,
-    locked,
+    exclusive,
     named_errors,
     read_lines,
-    sync_folder,
+    try_lock,
     write_atomically,
 )
 
@@ -50,54 +51,69 @@ class Dataset:
         self.path = Path(path)
         if create:
             try:
-                (self.path / "episodes" / ".partial").mkdir(parents=True, exist_ok=True)
+                self.partials.folder.mkdir(parents=True, exist_ok=True)
             except OSError as err:
                 raise CurationError(f"dataset {self.path}: {err.strerror}") from err
-        elif not (self.path / "episodes").is_dir():
+        elif not layout.is_dataset(self.path):
             hint = hint_of_datasets(self.path)
-            raise CurationError(f"dataset {self.path}: no folder 'episodes' in it{hint}")
+            raise CurationError(f"dataset {self.path}: no folder {layout.EPISODES!r} in it{hint}")
 
     # --- bags -------------------------------------------------------------------------------
 
+    @property
+    def episodes_folder(self) -> Path:
+        """Folder of the bags."""
+        return self.path / layout.EPISODES
+
     def bag_path(self, episode_id: str) -> Path:
         """Folder of an episode's bag, whether it exists or not."""
-        return self.path / "episodes" / episode_id
-
-    def partial_path(self, episode_id: str) -> Path:
-        """Folder that a recorder claims, by exclusive creation, while it writes."""
-        return self.path / "episodes" / ".partial" / episode_id
-
-    def publish_bag(self, episode_id: str) -> Path:
-        """Move a finished bag out of `.partial`.
-
-        Raises:
-            BagError: if it cannot be moved.
-        """
-        target = self.bag_path(episode_id)
-        try:
-            os.rename(self.partial_path(episode_id), target)
-            sync_folder(target.parent)
-        except OSError as err:
-            raise BagError(f"bag {target}: {err.strerror}") from err
-        return target
+        return self.episodes_folder / episode_id
 
     def bags(self) -> Iterator[Path]:
         """Folders of the bags, in the order of their ids (which is the order of recording)."""
-        episodes = self.path / "episodes"
-        return iter(sorted(p for p in episodes.iterdir() if p.is_dir() and p.name[0] != "."))
+        entries = self.episodes_folder.iterdir()
+        return iter(sorted(p for p in entries if p.is_dir() and p.name[0] != "."))
+
+    @cached_property
+    def partials(self) -> PartialBags:
+        """Bags that are being written, and those that dead recorders have left."""
+        return PartialBags(self.episodes_folder)
+
+    def quarantine(self, bag: Path, suffix: str) -> None:
+        """Move a bag to `quarantine/<its name>.<suffix>`; an OSError says why it cannot be."""
+        target = self.path / layout.QUARANTINE / f"{bag.name}.{suffix}"
+        target.parent.mkdir(exist_ok=True)
+        bag.rename(target)
+
+    @contextmanager
+    def sole_collection(self) -> Iterator[None]:
+        """Keep out other collections, which would collect the same episodes.
+
+        Raises:
+            CurationError: if another collection is running, or the dataset cannot be written.
+        """
+        path = self.episodes_folder / layout.COLLECTING
+        with named_errors(path):
+            lock = try_lock(path)
+        if lock is None:
+            raise CurationError(f"dataset {self.path}: another collection is running")
+        with lock:
+            yield
+
+    # --- episodes ---------------------------------------------------------------------------
 
     def names(self) -> list[tuple[str, str]]:
         """(id, short name) of every episode, from bags and decision logs."""
         self.refresh()
-        with self.index.transaction() as db:
-            named = dict(db.execute("SELECT id, name FROM episodes"))
-        for log in (self.path / "decisions").glob("*.jsonl"):
-            lines = read_lines(log)
-            named.setdefault(log.stem, str(lines[-1].get("name", "")) if lines else "")
+        named = {e.id: e.name for e in self.index.episodes()}
+        for episode_id in self.decided_ids():
+            if episode_id not in named:
+                lines = read_lines(self.decision_log(episode_id))
+                named[episode_id] = str(lines[-1].get("name", "")) if lines else ""
         return sorted(named.items())
 
     def find(self, prefix: str) -> str:
-        """Id of the episode that a person means by a short name or the beginning of an id.
+        """Id of the episode with a short name, or with an id that begins with the prefix.
 
         Raises:
             EpisodeError: if nothing or more than one episode fits.
@@ -106,9 +122,18 @@ class Dataset:
 
     # --- decisions --------------------------------------------------------------------------
 
+    @property
+    def decisions_folder(self) -> Path:
+        """Folder of the decision logs; it may not exist yet."""
+        return self.path / layout.DECISIONS
+
     def decision_log(self, episode_id: str) -> Path:
         """Log of an episode's decisions."""
-        return self.path / "decisions" / f"{episode_id}.jsonl"
+        return self.decisions_folder / f"{episode_id}.jsonl"
+
+    def decided_ids(self) -> list[str]:
+        """Ids of the episodes that have a decision log, in order."""
+        return sorted(log.stem for log in self.decisions_folder.glob("*.jsonl"))
 
     def decisions(self, episode_id: str) -> list[Decision]:
         """All decisions on an episode, oldest first.
@@ -126,27 +151,10 @@ class Dataset:
         """The decision in force of every decided episode, by id and in the order of ids.
 
         Args:
-            last: of so many episodes, those with the highest (youngest) ids; None: of all.
+            last: only the episodes with the highest (youngest) ids, this many; None: all.
         """
-        logs = sorted((self.path / "decisions").glob("*.jsonl"))[-(last or 0) :]
-        return in_force(d for log in logs for d in self.decisions(log.stem))
-
-    def start_of(self) -> dict[str, tuple[str, str, int]]:
-        """Episode id -> (task, start state, repetition), where they were noted; no labels."""
-        return {
-            i: (str(t.get("task", "")), str(t["start"]), int(t.get("repetition", 0)))
-            for i, t in self.truth().items()
-            if "start" in t
-        }
-
-    def tie(self, seed: int) -> TieKey:
-        """Episode id -> key that orders equal scores: a hash of its start, where that is noted."""
-        starts = self.start_of()
-
-        def key(episode_id: str) -> str:
-            return tie_key(seed, *starts.get(episode_id, (episode_id,)))
-
-        return key
+        ids = self.decided_ids()[-(last or 0) :]
+        return in_force(d for i in ids for d in self.decisions(i))
 
     def append_decision(
         self,
@@ -155,22 +163,22 @@ class Dataset:
         amend: bool = False,
         unless: Callable[[Sequence[Decision]], bool] | None = None,
     ) -> Decision | None:
-        """Log a decision under the next revision number, on disk when this returns.
+        """Log a decision under the next revision number; it is on the disk on return.
 
         Args:
             decision: its own revision number counts only to amend.
             amend: log it under its own number (the same decision with more evidence).
-            unless: is shown what is logged already; where it says so, nothing is added.
+            unless: called with what is logged already; if it returns true, nothing is added.
 
         Returns:
-            The decision with the revision that it got; None if it was not wanted any more.
+            The decision with its revision; None if nothing was added.
 
         Raises:
             CurationError: if the log cannot be written.
         """
         log = self.decision_log(decision.episode)
         # The lock makes numbering and appending one step when curator and CLI decide at once.
-        with named_errors(log), locked(log.parent):
+        with named_errors(log), exclusive(log.parent / layout.LOCK):
             known = self.decisions(decision.episode)
             if unless is not None and unless(known):
                 return None
@@ -178,8 +186,8 @@ class Dataset:
                 revisions = [d.revision for d in known]
                 decision = replace(decision, revision=max(revisions, default=0) + 1)
             append_line(log, decision.to_json())
-        with suppress(CurationError), self.index.transaction() as db:
-            _index_decision(db, decision)
+        with suppress(CurationError):  # a cache that cannot be used now costs no decision
+            self.index.note_decision(decision)
         return decision
 
     def with_content(self, content: str, *, other_than: str) -> tuple[str, str] | None:
@@ -187,38 +195,42 @@ class Dataset:
 
         Args:
             content: `Episode.content_digest`.
-            other_than: id of the episode that is asked for; older ones have lower ids.
+            other_than: id of the episode with that content; older ones have lower ids.
         """
-        query = (
-            "SELECT d.episode, coalesce(e.name, '') FROM decisions d "
-            "LEFT JOIN episodes e ON e.id = d.episode "
-            "WHERE d.content = ? AND d.episode < ? ORDER BY d.episode LIMIT 1"
-        )
         try:
-            with self.index.transaction() as db:
-                row = db.execute(query, (content, other_than)).fetchone()
+            return self.index.decided_with_content(content, before=other_than)
         except CurationError:  # a cache that cannot be used now costs no decision
             return None
-        return (str(row[0]), str(row[1])) if row is not None else None
 
-    # --- truth and selections ---------------------------------------------------------------
+    # --- truth ------------------------------------------------------------------------------
+
+    @cached_property
+    def truth_log(self) -> TruthLog:
+        """The log of outcomes and injected defects."""
+        return TruthLog(self.path / layout.TRUTH)
 
     def append_truth(self, record: Mapping[str, Any]) -> None:
-        """Append a line to truth.jsonl: outcomes and injected defects, for evaluation only.
-
-        Raises:
-            CurationError: if it cannot be written.
-        """
-        path = self.path / "truth.jsonl"
-        with named_errors(path):
-            append_line(path, record)
+        """Append a line to the truth; see `TruthLog.append`."""
+        self.truth_log.append(record)
 
     def truth(self) -> dict[str, dict[str, Any]]:
-        """Merged truth lines by episode id; later lines win."""
-        merged: dict[str, dict[str, Any]] = {}
-        for line in read_lines(self.path / "truth.jsonl"):
-            merged.setdefault(str(line.get("episode")), {}).update(line)
-        return merged
+        """Merged truth by episode id; see `TruthLog.by_episode`."""
+        return self.truth_log.by_episode()
+
+    def tie(self, seed: int) -> TieKey:
+        """Episode id -> key that orders equal scores: a hash of its start, where that is noted."""
+        starts = self.truth_log.starts()
+
+        def key(episode_id: str) -> str:
+            return tie_key(seed, *starts.get(episode_id, (episode_id,)))
+
+        return key
+
+    # --- selections and policies ------------------------------------------------------------
+
+    def selection_path(self, name: str) -> Path:
+        """File of a selection, whether it exists or not."""
+        return self.path / layout.SELECTIONS / f"{name}.json"
 
     def save_manifest(self, manifest: Manifest) -> Path:
         """Write a selection; the name decides the file, and a file is never overwritten.
@@ -226,15 +238,18 @@ class Dataset:
         Raises:
             CurationError: if a selection of that name exists, or it cannot be written.
         """
-        path = self.path / "selections" / f"{manifest.name}.json"
+        path = self.selection_path(manifest.name)
         text = json.dumps(manifest.to_json(), indent=1, allow_nan=False) + "\n"
-        with named_errors(path), locked(path.parent):
-            if path.exists():
-                raise CurationError(f"selection {path} exists: choose another --name")
-            write_atomically(path, text)
-        with suppress(CurationError), self.index.transaction() as db:
-            _index_selection(db, manifest, path)
+        with named_errors(path):
+            try:
+                write_atomically(path, text, replace=False)
+            except FileExistsError as err:
+                raise CurationError(f"selection {path} exists: choose another --name") from err
         return path
+
+    def policy_path(self, policy_id: str) -> Path:
+        """Folder of a policy that was trained on this dataset, whether it exists or not."""
+        return self.path / layout.POLICIES / policy_id
 
     # --- index ------------------------------------------------------------------------------
 
@@ -244,130 +259,61 @@ class Dataset:
         return Index(self.path)
 
     def refresh(self) -> list[str]:
-        """Bring the index up to date with bags that have come or gone.
+        """Bring the index up to date with bags that were added or removed.
 
         Returns:
             One line for every bag that could not be read; the others are indexed all the same.
         """
         present = {p.name: p for p in self.bags()}
         try:
-            with self.index.transaction() as db:
-                known = {row[0] for row in db.execute("SELECT id FROM episodes")}
+            known = {e.id for e in self.index.episodes()}
         except SpoiltIndexError:
             return self.rebuild()
-        rows, problems = _bag_rows({i: present[i] for i in sorted(set(present) - known)})
-        gone = [(i,) for i in known - set(present)]
-        if rows or gone:
-            with self.index.transaction() as db:
-                db.executemany("DELETE FROM episodes WHERE id = ?", gone)
-                db.executemany(_INSERT_EPISODE, rows)
+        new, problems = _indexed({i: present[i] for i in sorted(set(present) - known)})
+        gone = known - set(present)
+        if new or gone:
+            self.index.update_episodes(new, gone)
         return problems
 
     def rebuild(self) -> list[str]:
-        """Make the index anew from bags, logs and manifests; returns what was unreadable."""
-        rows, problems = _bag_rows({p.name: p for p in self.bags()})
+        """Make the index anew from bags and decision logs; returns what was unreadable."""
+        episodes, problems = _indexed({p.name: p for p in self.bags()})
         decisions: list[Decision] = []
-        for log in sorted((self.path / "decisions").glob("*.jsonl")):
+        for episode_id in self.decided_ids():
             try:
-                decisions += self.decisions(log.stem)
+                decisions += self.decisions(episode_id)
             except CurationError as err:
                 problems.append(str(err))
-        manifests: list[tuple[Manifest, Path]] = []
-        for path in sorted((self.path / "selections").glob("*.json")):
-            try:
-                manifests.append((Manifest.from_json(json.loads(path.read_text())), path))
-            except (ValueError, OSError, CurationError) as err:
-                problems.append(f"selection {path}: {err}")
-
-        def fill() -> None:
-            with self.index.transaction() as db:
-                for table in TABLES:
-                    db.execute(f"DELETE FROM {table}")
-                db.executemany(_INSERT_EPISODE, rows)
-                for decision in decisions:
-                    _index_decision(db, decision)
-                for manifest, path in manifests:
-                    _index_selection(db, manifest, path)
-
-        try:
-            fill()
-        except SpoiltIndexError:
-            # Only a file that is of no use to anybody is removed from under other processes.
-            self.index.remove()
-            fill()
+        self.index.refill(episodes, decisions)
         return problems
 
-    def rows(self, query: str, parameters: tuple[object, ...] = ()) -> list[sqlite3.Row]:
-        """Read from the index (its tables stand in index.py).
 
-        Raises:
-            CurationError: if it is spoilt, or the query makes no sense.
-        """
-        with self.index.transaction() as db:
-            db.row_factory = sqlite3.Row
-            return list(db.execute(query, parameters))
-
-
-_INSERT_EPISODE = "INSERT OR REPLACE INTO episodes VALUES (?,?,?,?,?,?,?,?)"
-
-
-def _bag_rows(folders: Mapping[str, Path]) -> tuple[list[tuple[object, ...]], list[str]]:
-    """Rows of the table episodes, and what is wrong with the bags that have none."""
-    rows, problems = [], []
+def _indexed(folders: Mapping[str, Path]) -> tuple[list[IndexedEpisode], list[str]]:
+    """What the index notes on bags, and what is wrong with those that it cannot note."""
+    episodes, problems = [], []
     for episode_id, folder in folders.items():
         try:
-            rows.append(_bag_row(open_bag(folder), episode_id))
+            episodes.append(_indexed_episode(open_bag(folder), episode_id))
         except CurationError as err:
             problems.append(str(err))
-    return rows, problems
+    return episodes, problems
 
 
-def _bag_row(bag: Bag, episode_id: str) -> tuple[object, ...]:
+def _indexed_episode(bag: Bag, episode_id: str) -> IndexedEpisode:
     event = bag.event()
     if event is None:
         raise EpisodeError(f"bag {bag.path}: no 'episode' in its custom data: not of our recorder")
     end_ns = event.end_ns
-    if end_ns is None:  # the recorder died before it was said
+    if end_ns is None:  # the recorder died before the end was announced
         with suppress(CurationError):
             end_ns = int(episode_of(bag).stamps_ns[-1])
-    return (
-        episode_id,
-        event.name,
-        f"episodes/{episode_id}",
-        event.start_ns,
-        end_ns or event.start_ns,
-        event.event,
-        event.source,
-        int(bag.custom_data.get("recovered") == "true"),
-    )
-
-
-def _index_decision(db: sqlite3.Connection, d: Decision) -> None:
-    db.execute(
-        "INSERT OR REPLACE INTO decisions VALUES (?,?,?,?,?,?,?,?,?)",
-        (
-            d.episode,
-            d.revision,
-            d.verdict,
-            d.reason,
-            d.by,
-            d.state_hash,
-            *d.span,
-            str(d.evidence.get("content", "")),
-        ),
-    )
-    scoring = str(d.evidence.get("scoring", ""))
-    db.executemany(
-        "INSERT OR REPLACE INTO scores VALUES (?,?,?,?,?)",
-        [
-            (d.episode, scorer, scoring, value, d.abstained.get(scorer))
-            for scorer, value in d.scores.items()
-        ],
-    )
-
-
-def _index_selection(db: sqlite3.Connection, manifest: Manifest, path: Path) -> None:
-    db.execute(
-        "INSERT OR REPLACE INTO selections VALUES (?,?,?,?,?)",
-        (manifest.name, str(path), manifest.created_at, len(manifest.entries), manifest.kept_of),
+    return IndexedEpisode(
+        id=episode_id,
+        name=event.name,
+        path=f"{layout.EPISODES}/{episode_id}",
+        start_ns=event.start_ns,
+        end_ns=end_ns or event.start_ns,
+        event=event.event,
+        source=event.source,
+        is_recovered=bag.custom_data.get("recovered") == "true",
     )

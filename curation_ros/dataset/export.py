@@ -5,9 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ from curation_ros.core.scorers import SCORERS
 from curation_ros.core.types import NS_PER_S, Span
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.manifests import read_manifest
-from curation_ros.files import sync_folder
+from curation_ros.files import named_errors, write_atomically
 
 #: Format -> what it holds. The only list; the command line is made from it.
 FORMATS: dict[str, str] = {
@@ -89,7 +87,7 @@ def export(
                 "--write, or name a --selection"
             )
         data = json.dumps(keep_json(entries, manifest), indent=1, allow_nan=False) + "\n"
-        _write(out, data.encode(), force=force)
+        _write(out, data, force=force)
     else:
         rows = rows_of(dataset, names, decided, selected)
         write = _parquet if file_format == "parquet" else _csv
@@ -103,7 +101,7 @@ def export(
 
 
 def _manifest(dataset: Dataset, selection: str) -> Manifest:
-    manifest, _ = read_manifest(dataset.path / "selections" / f"{selection}.json")
+    manifest, _ = read_manifest(dataset.selection_path(selection))
     return manifest
 
 
@@ -234,22 +232,14 @@ def _parquet(rows: Sequence[Mapping[str, Any]]) -> bytes:
     return sink.getvalue()
 
 
-def _write(path: Path, data: bytes, *, force: bool) -> None:
+def _write(path: Path, data: str | bytes, *, force: bool) -> None:
     """Write a whole file or nothing.
 
     Raises:
-        CurationError: if it is there and is not to be overwritten, or cannot be written.
+        CurationError: if it exists and must not be overwritten, or cannot be written.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(data)
-        if not force and path.exists():
-            raise CurationError(f"{path} exists: --force overwrites it")
-        os.replace(part, path)
-        sync_folder(path.parent)
-    except OSError as err:
-        raise CurationError(f"{err.filename or path}: {err.strerror or err}") from err
-    finally:
-        with suppress(OSError):
-            part.unlink()
+    with named_errors(path):
+        try:
+            write_atomically(path, data, replace=force)
+        except FileExistsError as err:
+            raise CurationError(f"{path} exists: --force overwrites it") from err

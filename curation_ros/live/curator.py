@@ -333,15 +333,15 @@ def decide_dataset(
 def _known_scores(dataset: Dataset, curation: Curation) -> dict[str, float | None]:
     """Deciding scores of the episodes that this curation's scorers have seen before."""
     found = {}
-    for log in sorted((dataset.path / "decisions").glob("*.jsonl")):
-        own = [d for d in dataset.decisions(log.stem) if d.by == CURATOR]
-        last = in_force(own).get(log.stem)
+    for episode_id in dataset.decided_ids():
+        own = [d for d in dataset.decisions(episode_id) if d.by == CURATOR]
+        last = in_force(own).get(episode_id)
         if (
             last is not None
             and last.evidence.get("scoring") == curation.scoring_hash
             and not decisions.untrustworthy(last.findings)
         ):
-            found[log.stem] = last.scores.get(curation.rule_scorer)
+            found[episode_id] = last.scores.get(curation.rule_scorer)
     return found
 
 
@@ -423,23 +423,22 @@ def override(
 
 def _duration_ns(dataset: Dataset, previous: Decision, known: Sequence[Decision]) -> int:
     """How long an episode is: as its bag says, or as far as anybody has decided on it."""
-    query = "SELECT end_ns - start_ns AS ns FROM episodes WHERE id = ?"
-    said = [row["ns"] for row in dataset.rows(query, (previous.episode,))]
-    ends_ns = [*(int(ns) for ns in said), *(d.span[1] for d in known), previous.span[1]]
-    return max(ends_ns)
+    indexed = dataset.index.episode(previous.episode)
+    ends_ns = [*(d.span[1] for d in known), previous.span[1]]
+    return max(ends_ns if indexed is None else [*ends_ns, indexed.duration_ns])
 
 
 def _undecided(dataset: Dataset, episode_id: str, state_hash: str) -> Decision:
     """What stands for an episode that the curator has not seen."""
-    rows = dataset.rows("SELECT name, start_ns, end_ns FROM episodes WHERE id = ?", (episode_id,))
-    if not rows:
+    indexed = dataset.index.episode(episode_id)
+    if indexed is None:
         raise EpisodeError(f"episode {episode_id}: no bag in {dataset.path}")
     return Decision(
         episode=episode_id,
-        name=rows[0]["name"],
+        name=indexed.name,
         verdict="review",
         reason="not decided",
-        span=(0, rows[0]["end_ns"] - rows[0]["start_ns"]),
+        span=(0, indexed.duration_ns),
         state_hash=state_hash,
     )
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Literal
+from typing import Literal
 
 from curation_ros.bags.qos import QosProfile
 from curation_ros.bags.reader import open_bag
@@ -21,9 +20,10 @@ from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import BagError, CurationError
 from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.partials import RECOVERING
+from curation_ros.files import FileLock
 from curation_ros.version import __version__
 
-_LOCK = ".lock"
 _SPACE_PERIOD_S = 1.0
 
 
@@ -76,7 +76,7 @@ class _TopicStats:
 class _OpenBag:
     event: EpisodeEvent
     writer: BagWriter
-    lock: IO[str]
+    lock: FileLock
     stats: dict[str, _TopicStats]
 
 
@@ -200,9 +200,9 @@ class Recording:
         if self.free_mb() < self.min_free_mb:
             reason = f"{self.free_mb():.0f} MB free, at least {self.min_free_mb:g} are wanted"
             return Notice("failed", event.id, event.name, reason)
-        folder = self.dataset.partial_path(event.id)
+        folder = self.dataset.partials.path(event.id)
         try:
-            lock = _claim(folder)
+            lock = self.dataset.partials.claim(event.id)
         except OSError as err:
             reason = f"{err.filename or folder}: {err.strerror}"
             return Notice("failed", event.id, event.name, reason)
@@ -211,7 +211,7 @@ class Recording:
         try:
             writer = BagWriter(folder, event.id, custom_data=self._custom_data(event))
         except CurationError as err:
-            lock.close()
+            lock.release()
             return Notice("failed", event.id, event.name, str(err))
         stats = {t: _TopicStats(publishers=self._publishers(t)) for t in self.topics}
         bag = _OpenBag(event, writer, lock, stats)
@@ -258,30 +258,29 @@ class Recording:
             return self._drop(bag, "no message of it has arrived")
         try:
             bag.writer.close(self._custom_data(event, bag.stats, closed))
-            self.dataset.publish_bag(event.id)
-            _unclaim(self.dataset.partial_path(event.id))
+            self.dataset.partials.publish(event.id)
+            self.dataset.partials.forget(event.id)
         except CurationError as err:
             bag.writer.abandon()
             return Notice("failed", event.id, event.name, str(err))
         finally:
-            bag.lock.close()
+            bag.lock.release()
         reason = "; ".join(lines)
         return Notice("closed", event.id, event.name, reason, closed.counts)
 
     def _drop(self, bag: _OpenBag, reason: str) -> Notice:
         """Remove a bag that has nothing in it."""
-        folder = self.dataset.partial_path(bag.event.id)
         bag.writer.abandon()
-        shutil.rmtree(folder, ignore_errors=True)
-        _unclaim(folder)
-        bag.lock.close()
+        shutil.rmtree(self.dataset.partials.path(bag.event.id), ignore_errors=True)
+        self.dataset.partials.forget(bag.event.id)
+        bag.lock.release()
         return Notice("failed", bag.event.id, bag.event.name, reason)
 
     def _fail(self, episode_id: str, reason: str) -> Notice:
         """Give up a bag; what is on disk stays in `.partial` for the next start to recover."""
         bag = self._open.pop(episode_id)
         bag.writer.abandon()
-        bag.lock.close()
+        bag.lock.release()
         return Notice("failed", episode_id, bag.event.name, reason)
 
     def _custom_data(
@@ -313,44 +312,25 @@ class Recording:
         return data
 
 
-def _claim(folder: Path) -> IO[str] | None:
-    """Lock a partial bag for as long as the file is open; None where somebody else has it.
-
-    The lock lies beside the folder: whoever creates that one must have the lock already.
-    """
-    lock = folder.with_name(folder.name + _LOCK).open("a")
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        lock.close()
-        return None
-    return lock
-
-
-def _unclaim(folder: Path) -> None:
-    folder.with_name(folder.name + _LOCK).unlink(missing_ok=True)
-
-
 def recover_partials(dataset: Dataset) -> list[Notice]:
-    """Make whole bags of what recorders that died have left in `.partial`.
+    """Make whole bags of the partial ones that dead recorders have left.
 
-    Each becomes a new bag under its own id, marked as recovered; the torn one moves to
-    `quarantine/`. Bags that a living recorder writes are left alone.
+    Each becomes a new bag under its own id, marked as recovered, and the torn one moves to
+    quarantine. Bags that a living recorder writes stay as they are.
 
     Returns:
-        A notice a partial bag: closed, or failed with the reason (it then stays where it is).
+        One notice per partial bag: closed, or failed with the reason (the bag then stays where it
+        is).
     """
     notices = []
-    for partial in sorted(dataset.partial_path("").glob("*")):
-        if not partial.is_dir() or partial.suffix == ".recovering":
-            continue
-        lock = _claim(partial)
+    for partial in dataset.partials.all():
+        lock = dataset.partials.claim(partial.name)
         if lock is None:
             continue
         with lock:
             try:
                 notices.append(_recover(dataset, partial))
-                _unclaim(partial)
+                dataset.partials.forget(partial.name)
             except (CurationError, OSError) as err:
                 notices.append(Notice("failed", partial.name, "", f"not recovered: {err}"))
     return notices
@@ -361,10 +341,9 @@ def _recover(dataset: Dataset, partial: Path) -> Notice:
     if target.exists():  # a recovery was killed after its bag had appeared, which is then whole
         reason = "its bag is there already"
     else:
-        report = recover_bag(partial, target)
+        scratch = partial.with_name(partial.name + RECOVERING)
+        report = recover_bag(partial, target, scratch=scratch)
         reason = f"recovered {sum(report.messages.values())} messages ({report.tail})"
     event = open_bag(target).event()
-    kept = dataset.path / "quarantine" / f"{partial.name}.partial"
-    kept.parent.mkdir(exist_ok=True)
-    partial.rename(kept)
+    dataset.quarantine(partial, "partial")
     return Notice("closed", partial.name, event.name if event is not None else "", reason)

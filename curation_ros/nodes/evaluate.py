@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import tempfile
 import threading
@@ -13,6 +12,7 @@ from typing import Any
 
 from curation_ros.core.errors import CurationError
 from curation_ros.core.statistics.intervals import wilson
+from curation_ros.dataset.dataset import Dataset
 from curation_ros.nodes.processes import Domain, Nodes
 
 # A step takes milliseconds; with this much silence something hangs.
@@ -54,6 +54,7 @@ def evaluate_on_graph(
         tempfile.TemporaryDirectory(prefix="curation_ros-evaluate-") as folder,
         Nodes(domain, log_folder) as nodes,
     ):
+        truth_log = Dataset(folder, create=True).truth_log
         try:
             nodes.start("policy_node", {"policy": policy})
             nodes.start(
@@ -74,9 +75,9 @@ def evaluate_on_graph(
             while seen < n and not (stop is not None and stop.is_set()):
                 ended = nodes.ended("sim_node") is not None
                 _check_nodes(nodes, log_folder)
-                lines = _whole_lines(Path(folder) / "truth.jsonl")
+                lines = truth_log.lines()
                 for line in lines[seen:]:
-                    yield _row(policy_id, json.loads(line))
+                    yield _row(policy_id, line)
                 if len(lines) > seen:
                     seen, heard_s = len(lines), time.monotonic()
                 elif ended:
@@ -127,14 +128,6 @@ def summary(policy_id: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "ci95": [low, high],
         "interval": "wilson",
     }
-
-
-def _whole_lines(path: Path) -> list[str]:
-    try:
-        text = path.read_text()
-    except FileNotFoundError:
-        return []
-    return text[: text.rfind("\n") + 1].splitlines()
 
 
 def _row(policy_id: str, truth: dict[str, Any]) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import os
 import random
 import signal
@@ -18,6 +17,7 @@ from types import MappingProxyType, TracebackType
 from typing import IO, Any
 
 from curation_ros.core.errors import CurationError
+from curation_ros.files import try_lock
 from curation_ros.nodes.programs import NODE_MODULES
 
 # Domains above 101 need ports of the ephemeral range of Linux.
@@ -42,9 +42,10 @@ class Domain:
                 continue
             path = Path(tempfile.gettempdir()) / f"curation_ros-domain-{candidate}.lock"
             try:
-                lock = path.open("a")
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
+                lock = try_lock(path)
+            except OSError:  # the file is another user's
+                continue
+            if lock is None:
                 continue
             self.id = candidate
             self._lock = lock
@@ -61,7 +62,7 @@ class Domain:
 
     def close(self) -> None:
         """Give the domain id back."""
-        self._lock.close()
+        self._lock.release()
 
 
 def _is_in_use(domain_id: int) -> bool:

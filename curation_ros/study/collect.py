@@ -7,10 +7,8 @@ So bags and truth have the form, and the values, of those that are recorded on t
 
 from __future__ import annotations
 
-import fcntl
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -129,7 +127,7 @@ def collect(
     """
     plan = collection.plan()
     dataset = Dataset(folder, create=True)
-    with _alone(dataset):
+    with dataset.sole_collection():
         known = _known(dataset, plan)
         for name, truth in known.items():
             yield Collected(name, truth, str(truth["aborted"]), is_known=True)
@@ -148,22 +146,6 @@ def collect(
             raise CurationError(
                 f"{err}: what was collected is kept, run the same command again to go on"
             ) from err
-
-
-@contextmanager
-def _alone(dataset: Dataset) -> Iterator[None]:
-    """Two collections at once would collect the same episodes."""
-    path = dataset.path / "episodes" / ".collecting"
-    try:
-        lock = path.open("a")
-    except OSError as err:
-        raise CurationError(f"{path}: {err.strerror}") from err
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise CurationError(f"dataset {dataset.path}: another collection is running") from None
-        yield
 
 
 def _known(dataset: Dataset, plan: dict[str, EpisodePlan]) -> dict[str, dict[str, Any]]:
@@ -185,9 +167,7 @@ def _known(dataset: Dataset, plan: dict[str, EpisodePlan]) -> dict[str, dict[str
     for episode_id, name in dataset.names():
         bag = dataset.bag_path(episode_id)
         if name in plan and episode_id not in whole and bag.is_dir():
-            target = dataset.path / "quarantine" / f"{episode_id}.untold"
-            target.parent.mkdir(exist_ok=True)
-            bag.rename(target)
+            dataset.quarantine(bag, "untold")
     return {name: known[name] for name in plan if name in known}
 
 

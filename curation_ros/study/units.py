@@ -6,7 +6,6 @@ that was killed goes on from there; a unit that failed is tried once more by the
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import re
@@ -22,7 +21,7 @@ from curation_ros.batch.workers import WorkerDiedError, check_workers, in_flight
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError, PolicyError
 from curation_ros.core.types import Span
-from curation_ros.files import append_line, named_errors, read_lines
+from curation_ros.files import append_line, named_errors, read_lines, try_lock
 from policy_node.policy import Policy
 from policy_node.rollouts import Rollout, rollout
 from sim_node.env import process_env
@@ -348,12 +347,10 @@ class Judge:
     def _alone(self) -> Iterator[None]:
         """Two processes at once would do the same units."""
         with named_errors(self._log):
-            lock = (self.folder / ".judge.lock").open("a")
+            lock = try_lock(self.folder / ".judge.lock")
+        if lock is None:
+            raise CurationError(f"{self.folder}: another process runs this study")
         with lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise CurationError(f"{self.folder}: another process runs this study") from None
             yield
 
 

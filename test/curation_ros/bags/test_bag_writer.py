@@ -250,7 +250,7 @@ def test_full_disk_is_a_bag_error_and_keeps_what_was_flushed(
         def no_folder(path: Path) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-        monkeypatch.setattr("curation_ros.bags.writer.sync_folder", no_folder)
+        monkeypatch.setattr("curation_ros.files.sync_folder", no_folder)
     else:
         monkeypatch.setattr(os, "write", full)
     with pytest.raises(BagError, match="No space left on device") as caught:

@@ -153,9 +153,3 @@ def test_folder_that_is_no_dataset_is_told(curation: Run, folder: Path) -> None:
         told = curation("select", path, "--json")
         assert (told.code, told.out) == (NOTHING, "")
         assert f"dataset {path}" in told.err
-
-
-def test_selection_is_in_the_index(curation: Run, data: Path) -> None:
-    curation("select", data, "--name", "mine")
-    [row] = Dataset(data).rows("SELECT name, kept, total FROM selections")
-    assert tuple(row) == ("mine", 2, 5)

@@ -8,6 +8,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,9 @@ from curation_ros.core.decision.manifest import Entry, Manifest
 from curation_ros.core.episode.identity import new_episode_id
 from curation_ros.core.errors import CurationError, EpisodeError
 from curation_ros.dataset.dataset import Dataset
-from curation_ros.dataset.index import file_system
+from curation_ros.dataset.index import IndexedEpisode, file_system
 from curation_ros.files import write_atomically
 
-TABLES = ("episodes", "decisions", "scores", "selections")
 ID = "0197aaaa-0000-7000-8000-000000000001"
 
 
@@ -53,8 +53,13 @@ def _manifest(name: str = "best", **changes: Any) -> Manifest:
     return Manifest(name=name, **values)
 
 
-def _tables(dataset: Dataset) -> dict[str, list[tuple[object, ...]]]:
-    return {t: sorted(map(tuple, dataset.rows(f"SELECT * FROM {t}")), key=repr) for t in TABLES}
+def _rows(dataset: Dataset, query: str) -> list[tuple[Any, ...]]:
+    with closing(sqlite3.connect(dataset.index.path)) as db:
+        return db.execute(query).fetchall()
+
+
+def _tables(dataset: Dataset) -> dict[str, list[tuple[Any, ...]]]:
+    return {t: sorted(_rows(dataset, f"SELECT * FROM {t}")) for t in ("episodes", "decisions")}
 
 
 def _at_once(work: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
@@ -101,26 +106,26 @@ def test_bags_are_in_the_order_of_recording_and_partial_ones_are_none(dataset: D
     ids = [new_episode_id() for _ in range(3)]
     for episode_id in reversed(ids):
         dataset.bag_path(episode_id).mkdir()
-    dataset.partial_path("x").mkdir()
+    dataset.partials.path("x").mkdir()
     (dataset.path / "episodes" / "notes.txt").write_text("")
     assert [p.name for p in dataset.bags()] == ids
 
 
 def test_published_bag_has_left_partial(dataset: Dataset) -> None:
-    dataset.partial_path(ID).mkdir()
-    (dataset.partial_path(ID) / "x").write_text("1")
-    assert dataset.publish_bag(ID) == dataset.bag_path(ID)
+    dataset.partials.path(ID).mkdir()
+    (dataset.partials.path(ID) / "x").write_text("1")
+    assert dataset.partials.publish(ID) == dataset.bag_path(ID)
     assert (dataset.bag_path(ID) / "x").read_text() == "1"
     with pytest.raises(CurationError, match=ID):
-        dataset.publish_bag(ID)
+        dataset.partials.publish(ID)
 
 
 def test_published_bag_never_replaces_another(dataset: Dataset) -> None:
-    for folder in (dataset.partial_path(ID), dataset.bag_path(ID)):
+    for folder in (dataset.partials.path(ID), dataset.bag_path(ID)):
         folder.mkdir()
         (folder / "x").write_text(folder.parent.name)
     with pytest.raises(CurationError, match=ID):
-        dataset.publish_bag(ID)
+        dataset.partials.publish(ID)
     assert (dataset.bag_path(ID) / "x").read_text() == "episodes"
 
 
@@ -150,8 +155,7 @@ def test_amended_decision_keeps_its_revision(dataset: Dataset) -> None:
     amended = dataset.append_decision(_decision(evidence={"bag": "equal"}), amend=True)
     assert amended.revision == first.revision == 1
     assert dataset.append_decision(_decision()).revision == 2
-    [row] = dataset.rows("SELECT COUNT(*) AS n FROM decisions")
-    assert row["n"] == 2
+    assert _rows(dataset, "SELECT COUNT(*) FROM decisions") == [(2,)]
     assert dataset.latest_decisions()[ID].revision == 2
 
 
@@ -164,8 +168,9 @@ def test_amending_a_decision_does_not_take_the_number_of_a_later_one(dataset: Da
     assert amended.revision == 1
     assert dataset.latest_decisions() == {ID: person}
     assert dataset.append_decision(_decision()).revision == 3
-    rows = dataset.rows("SELECT revision, by FROM decisions ORDER BY revision")
-    assert [tuple(r) for r in rows] == [(1, "curator"), (2, "Ada"), (3, "curator")]
+    by = {d.revision: d.by for d in dataset.decisions(ID)}
+    assert by == {1: "curator", 2: "Ada", 3: "curator"}
+    assert len(_rows(dataset, "SELECT * FROM decisions")) == 3
 
 
 def test_decision_of_a_person_is_in_force_whatever_comes_later(dataset: Dataset) -> None:
@@ -189,8 +194,7 @@ def test_processes_that_decide_at_once_get_consecutive_revisions(dataset: Datase
     assert sorted(r for own in numbers for r in own) == list(range(1, n_processes * n + 1))
     lines = dataset.decision_log(ID).read_text().splitlines()
     assert [json.loads(line)["revision"] for line in lines] == list(range(1, n_processes * n + 1))
-    [row] = dataset.rows("SELECT COUNT(*) AS n FROM decisions")
-    assert row["n"] == n_processes * n
+    assert _rows(dataset, "SELECT COUNT(*) FROM decisions") == [(n_processes * n,)]
 
 
 @pytest.mark.parametrize("cut", [1, 2, 40])
@@ -262,7 +266,10 @@ def test_truth_of_an_episode_is_merged_and_later_lines_win(dataset: Dataset) -> 
         "start": "official-01",
         "outcome": "succeeded",
     }
-    assert dataset.start_of() == {"a": ("", "official-01", 0), "b": ("t", "official-02", 3)}
+    assert dataset.truth_log.starts() == {
+        "a": ("", "official-01", 0),
+        "b": ("t", "official-02", 3),
+    }
 
 
 def _tell_often(path: Path, who: str, n: int) -> None:
@@ -330,12 +337,7 @@ def test_rebuilt_index_equals_the_one_that_grew(
     _filled(dataset, rng)
     assert dataset.refresh() == []
     grown = _tables(dataset)
-    assert {k: len(v) for k, v in grown.items()} == {
-        "episodes": 3,
-        "decisions": 4,
-        "scores": 6,
-        "selections": 1,
-    }
+    assert {k: len(v) for k, v in grown.items()} == {"episodes": 3, "decisions": 4}
     assert dataset.rebuild() == []
     assert _tables(dataset) == grown
     dataset.index.path.unlink()
@@ -349,17 +351,19 @@ def test_index_row_of_an_episode_says_what_its_bag_says(
     episode = short_episode(rng, 3, name="pick-7")
     record(dataset, episode)
     dataset.refresh()
-    [row] = dataset.rows("SELECT * FROM episodes")
-    assert tuple(row) == (
+    row = IndexedEpisode(
         episode.id,
         "pick-7",
         f"episodes/{episode.id}",
         episode.start_ns,
         episode.end_ns,
-        "ended",
-        "live",
-        0,
+        event="ended",
+        source="live",
+        is_recovered=False,
     )
+    assert dataset.index.episodes() == [row]
+    assert dataset.index.episode(episode.id) == row
+    assert dataset.index.episode("another") is None
 
 
 def test_refresh_follows_bags_that_come_and_go(dataset: Dataset, rng: np.random.Generator) -> None:
@@ -367,8 +371,7 @@ def test_refresh_follows_bags_that_come_and_go(dataset: Dataset, rng: np.random.
     dataset.refresh()
     shutil.rmtree(dataset.bag_path(ids[1]))
     dataset.refresh()
-    kept = [r["id"] for r in dataset.rows("SELECT id FROM episodes")]
-    assert sorted(kept) == sorted([ids[0], ids[2]])
+    assert [e.id for e in dataset.index.episodes()] == sorted([ids[0], ids[2]])
 
 
 def test_unreadable_bag_is_a_problem_of_its_own(
@@ -382,23 +385,18 @@ def test_unreadable_bag_is_a_problem_of_its_own(
     for problems in (dataset.refresh(), dataset.refresh(), dataset.rebuild()):
         assert len(problems) == 1
         assert str(spoilt) in problems[0]
-    assert [r["id"] for r in dataset.rows("SELECT id FROM episodes")] == [episode.id]
+    assert [e.id for e in dataset.index.episodes()] == [episode.id]
 
 
-def test_spoilt_logs_and_selections_are_problems_and_stop_nothing(
+def test_spoilt_log_is_a_problem_and_stops_nothing(
     dataset: Dataset, rng: np.random.Generator
 ) -> None:
     _filled(dataset, rng)
     dataset.refresh()
     grown = _tables(dataset)
     (dataset.path / "decisions" / "x.jsonl").write_text('{"episode": "x"}\n')
-    (dataset.path / "selections" / "a.json").write_text("{")
-    (dataset.path / "selections" / "b.json").write_text('{"name": "b"}')
-    (dataset.path / "selections" / "c.json").write_bytes(b"\xff\xfe")
-    problems = dataset.rebuild()
-    assert len(problems) == 4
-    for name, problem in zip(("x.jsonl", "a.json", "b.json", "c.json"), problems, strict=True):
-        assert name in problem
+    [problem] = dataset.rebuild()
+    assert "x.jsonl" in problem
     assert _tables(dataset) == grown
 
 
@@ -408,7 +406,7 @@ def test_spoilt_index_is_made_anew(dataset: Dataset, rng: np.random.Generator) -
     grown = _tables(dataset)
     dataset.index.path.write_bytes(b"this is no database at all" * 100)
     with pytest.raises(CurationError, match="--rebuild"):
-        dataset.rows("SELECT * FROM episodes")
+        dataset.index.episodes()
     dataset.append_decision(_decision())  # the log is the truth: it does not need the index
     assert len(dataset.decisions(ID)) == 1
     dataset.decision_log(ID).unlink()
@@ -419,7 +417,7 @@ def test_spoilt_index_is_made_anew(dataset: Dataset, rng: np.random.Generator) -
 def _refresh(path: Path, rebuild: bool) -> list[str]:
     dataset = Dataset(path)
     problems = dataset.rebuild() if rebuild else dataset.refresh()
-    return problems + [r["id"] for r in dataset.rows("SELECT id FROM episodes")]
+    return problems + [e.id for e in dataset.index.episodes()]
 
 
 @pytest.mark.parametrize("rebuild", [False, True])
@@ -430,7 +428,7 @@ def test_processes_that_index_at_once_agree(
     for _ in range(4):
         dataset.index.path.unlink(missing_ok=True)
         _at_once(_refresh, [(dataset.path, rebuild)] * 4)
-        assert [r["id"] for r in dataset.rows("SELECT id FROM episodes ORDER BY id")] == ids
+        assert [e.id for e in dataset.index.episodes()] == ids
         with sqlite3.connect(dataset.index.path) as db:
             assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
 
@@ -441,8 +439,7 @@ def test_slow_reader_of_the_index_holds_up_no_decision(dataset: Dataset) -> None
         reader.execute("BEGIN")
         reader.execute("SELECT * FROM episodes").fetchall()
         assert dataset.append_decision(_decision()).revision == 1
-    [row] = dataset.rows("SELECT COUNT(*) AS n FROM decisions")
-    assert row["n"] == 1
+    assert _rows(dataset, "SELECT COUNT(*) FROM decisions") == [(1,)]
 
 
 # --- where the index cannot be in the dataset ---------------------------------------------------

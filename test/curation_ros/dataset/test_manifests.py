@@ -179,7 +179,7 @@ def _with_starts(folder: Path, rng: np.random.Generator, order: list[int]) -> Da
 
 
 def _kept_starts(dataset: Dataset, seed: int, k: int = 3) -> list[str]:
-    starts = dataset.start_of()
+    starts = dataset.truth_log.starts()
     kept = _kept(dataset, rule="top-k", value=k, scorer="knn", seed=seed)
     return [starts[i][1] for i in kept]
 

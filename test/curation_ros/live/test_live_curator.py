@@ -552,8 +552,8 @@ def test_evidence_added_after_a_person_decided_takes_nobodys_number(dataset: Dat
     told = log_decision(dataset, replace(decision, evidence={"bag": "alone"}))
     assert told == person
     assert dataset.latest_decisions()[_good().id] == person
-    rows = dataset.rows("SELECT revision, by FROM decisions ORDER BY revision")
-    assert [tuple(r) for r in rows] == [(1, CURATOR), (2, "Ada")]
+    logged = dataset.decisions(person.episode)
+    assert {d.revision: d.by for d in logged} == {1: CURATOR, 2: "Ada"}
 
 
 def test_log_that_cannot_be_written_is_an_error_and_the_next_episode_is_decided(

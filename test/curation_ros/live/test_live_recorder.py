@@ -62,7 +62,7 @@ def _in_bag(bag_path: Path) -> list[Sample]:
 
 def _left(dataset: Dataset) -> list[str]:
     """Everything in `.partial`."""
-    return sorted(p.name for p in dataset.partial_path("").iterdir())
+    return sorted(p.name for p in dataset.partials.folder.iterdir())
 
 
 # --- what is in a bag ---------------------------------------------------------------------------
@@ -416,14 +416,14 @@ def test_dataset_that_vanishes_is_a_notice_and_no_crash(
 def test_claim_that_cannot_be_made_fails_the_episode(
     dataset: Dataset, rng: np.random.Generator
 ) -> None:
-    shutil.rmtree(dataset.partial_path(""))
-    dataset.partial_path("").write_text("in the way")
+    shutil.rmtree(dataset.partials.folder)
+    dataset.partials.folder.write_text("in the way")
     recording = make_recording(dataset)
     [failed] = recording.event(started(short_episode(rng)), 0.0)
     assert failed.state == "failed"
-    assert str(dataset.partial_path("")) in failed.reason
-    dataset.partial_path("").unlink()
-    dataset.partial_path("").mkdir()
+    assert str(dataset.partials.folder) in failed.reason
+    dataset.partials.folder.unlink()
+    dataset.partials.folder.mkdir()
     assert _states(feed(recording, short_episode(rng))) == ["recording", "closed"]
 
 
@@ -563,7 +563,7 @@ def test_killed_recorder_loses_at_most_one_flush_period(dataset: Dataset) -> Non
     episode = _interrupted()
     n_steps = 33
     killed_s = _killed_recorder(dataset, n_steps)
-    torn = dataset.partial_path(episode.id)
+    torn = dataset.partials.path(episode.id)
     original = (torn / f"{episode.id}_0.mcap").read_bytes()
 
     [notice] = recover_partials(dataset)
@@ -583,8 +583,8 @@ def test_killed_recorder_loses_at_most_one_flush_period(dataset: Dataset) -> Non
     assert _left(dataset) == []
     assert recover_partials(dataset) == []
     dataset.refresh()
-    [row] = dataset.rows("SELECT recovered, name, end_ns FROM episodes")
-    assert tuple(row) == (1, episode.name, built.stamps_ns[-1])
+    [row] = dataset.index.episodes()
+    assert (row.is_recovered, row.name, row.end_ns) == (True, episode.name, built.stamps_ns[-1])
 
 
 def test_bag_of_a_living_recorder_is_left_alone(
@@ -598,7 +598,7 @@ def test_bag_of_a_living_recorder_is_left_alone(
         recording.sample(sample, 0.0)
     _killed_recorder(dataset, 12)
     assert [n.id for n in recover_partials(dataset)] == [_interrupted().id]
-    assert dataset.partial_path(living.id).is_dir()
+    assert dataset.partials.path(living.id).is_dir()
     for sample in samples[70:]:
         recording.sample(sample, 0.0)
     notices += recording.event(ended(living), 0.0)
@@ -628,7 +628,7 @@ def test_episode_of_a_killed_recorder_can_go_on_with_its_successor(
 
 
 def test_what_cannot_be_recovered_is_reported_and_stays(dataset: Dataset) -> None:
-    empty, foreign = dataset.partial_path("a-empty"), dataset.partial_path("b-foreign")
+    empty, foreign = dataset.partials.path("a-empty"), dataset.partials.path("b-foreign")
     for folder in (empty, foreign):
         folder.mkdir()
     (foreign / "x_0.mcap").write_bytes(b"no mcap at all")
@@ -645,8 +645,8 @@ def test_what_cannot_be_recovered_is_reported_and_stays(dataset: Dataset) -> Non
 
 
 def test_leftovers_of_an_interrupted_recovery_are_no_partial_bag(dataset: Dataset) -> None:
-    dataset.partial_path("x.recovering").mkdir()
-    (dataset.partial_path("x.recovering") / "y").write_text("")
+    dataset.partials.path("x.recovering").mkdir()
+    (dataset.partials.path("x.recovering") / "y").write_text("")
     assert recover_partials(dataset) == []
 
 
@@ -654,7 +654,7 @@ def test_recovery_that_was_interrupted_after_its_bag_was_whole_is_finished(
     dataset: Dataset,
 ) -> None:
     _killed_recorder(dataset, 12)
-    [partial] = [p for p in dataset.partial_path("").iterdir() if p.is_dir()]
+    [partial] = [p for p in dataset.partials.folder.iterdir() if p.is_dir()]
     recover_bag(partial, dataset.bag_path(partial.name))  # and then it was killed
     before = _in_bag(dataset.bag_path(partial.name))
     [notice] = recover_partials(dataset)
@@ -676,7 +676,7 @@ def test_living_recorder_has_flushed_what_is_older_than_its_period(
         recording.sample(sample, now_s)
         if k % 35 == 0 and k:
             copy = tmp_path / f"copy{k}"
-            shutil.copytree(dataset.partial_path(episode.id), copy)
+            shutil.copytree(dataset.partials.path(episode.id), copy)
             report = recover_bag(copy, tmp_path / f"saved{k}")
             n_old = int((now_s - 0.1 - 100.0) / STEP_S)
             assert sum(report.messages.values()) >= n_old * N_TOPICS
