@@ -15,11 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.episode.topic_map import TopicMap
-from curation_ros.core.errors import ConfigError, CurationError, EpisodeError
+from curation_ros.core.errors import ConfigError, EpisodeError
 from curation_ros.core.evidence.length_control import MODES, LengthControl
 from curation_ros.core.scorers import SCORERS, Scorer
 from curation_ros.core.scorers.length import Length
@@ -27,13 +25,8 @@ from curation_ros.core.statistics import detection, length_confound
 from curation_ros.core.statistics.rank_correlation import rank_correlation
 from curation_ros.core.types import Floats, Mask
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.labels import LABELS, read_labels
 
-#: Field of the labels -> key in truth.jsonl, values that mean good, and what it says. For
-#: `success` a value that is neither good nor `failed` (an episode that was given up) is no label.
-LABELS: dict[str, str] = {
-    "success": "outcome: the simulator's check or a person's button; good is 'succeeded'",
-    "defect": "injected defect; good is 'none'",
-}
 #: Length control of audits alone: with labels, as the paper has it.
 SHORTEST_SUCCESS = "shortest-success"
 LENGTHS: dict[str, str] = {
@@ -122,36 +115,6 @@ class Audit:
     rows: tuple[dict[str, Any], ...]
     facts: Mapping[str, Any]
     notes: tuple[str, ...]
-
-
-def read_labels(dataset: Dataset, field_name: str) -> dict[str, bool]:
-    """Episode id -> whether it is good, of the episodes whose truth has that label.
-
-    Args:
-        dataset: whose `truth.jsonl` is read.
-        field_name: one of LABELS.
-    """
-    found: dict[str, bool] = {}
-    for episode_id, truth in dataset.truth().items():
-        if field_name == "success":
-            if truth.get("outcome") in ("succeeded", "failed"):
-                found[episode_id] = truth["outcome"] == "succeeded"
-        elif isinstance(truth.get("defect"), str) and truth["defect"]:
-            found[episode_id] = truth["defect"] == "none"
-    return found
-
-
-def read_episodes(
-    dataset: Dataset, topic_map: TopicMap | None = None
-) -> tuple[list[Episode], list[str]]:
-    """All episodes of a dataset in the order of their ids, and what could not be read."""
-    episodes, problems = [], []
-    for bag in dataset.bags():
-        try:
-            episodes.append(read_episode(bag, topic_map))
-        except CurationError as err:
-            problems.append(str(err))
-    return sorted(episodes, key=lambda e: e.id), problems
 
 
 def audit(

@@ -10,14 +10,7 @@ from typing import Any, TypeAlias
 from rich.console import JustifyMethod
 from rich.table import Table
 
-from curation_ros.batch.audit import (
-    LABELS,
-    LENGTHS,
-    Audit,
-    AuditSettings,
-    audit,
-    read_episodes,
-)
+from curation_ros.batch.audit import LENGTHS, Audit, AuditSettings, audit
 from curation_ros.cli.arguments import add_config, add_reference
 from curation_ros.cli.output import console, print_json, say, warn
 from curation_ros.configuration import read_curation, read_reference, share_file
@@ -25,6 +18,8 @@ from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.scorers import SCORERS
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episodes
+from curation_ros.dataset.labels import LABELS
 
 Column: TypeAlias = Callable[[Mapping[str, Any]], str]
 

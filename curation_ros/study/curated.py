@@ -1,11 +1,10 @@
-"""What the curator makes of a pool by itself, and how much of each phase a training set shows."""
+"""Decisions of the curator on a pool, and how much of each phase a training set shows."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from statistics import median
-from typing import Any
 
 import numpy as np
 
@@ -15,27 +14,25 @@ from curation_ros.core.decision.decision import VERDICTS, Decision
 from curation_ros.core.decision.salvage import good_prefix
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.scorers import SCORERS
-from curation_ros.core.types import Span
-
-Row = dict[str, Any]
+from curation_ros.core.types import JsonObject, Span
 
 
-def phases_alone(episode: Episode) -> Episode:
-    """An episode with its phases and stamps alone: all of a study's can be held at once."""
+def timeline_of(episode: Episode) -> Episode:
+    """The episode with only its phases and stamps, so that all of a study fit into memory."""
     names = [spec.name for spec in episode.topic_map.with_role("phase")]
     return replace(episode, fields={name: episode.fields[name] for name in names})
 
 
 @dataclass(frozen=True)
 class Curated:
-    """Decisions of the curator with its defaults, fitted on no reference.
+    """Decisions of the curator with its default configuration and without a reference.
 
     Attributes:
         decisions: id -> decision.
-        prefixes: margin -> id -> good beginning of an episode that broke, nanoseconds from the
-            start stamp. The margin is in control steps; None: the curator's own, and then these
-            are the spans of what it salvages.
-        example: the first episode by name that broke and is salvaged; None where there is none.
+        prefixes: margin -> id -> good beginning of an episode that broke, in nanoseconds from
+            the start stamp. The margin is in control steps. None stands for the curator's own
+            margin, and then these are the spans of the salvaged episodes.
+        example: the first salvaged episode by name that broke; None if there is none.
     """
 
     decisions: Mapping[str, Decision] = field(default_factory=dict)
@@ -53,20 +50,20 @@ class Curated:
 
 
 def curate(episodes: Iterable[Episode], margins: Iterable[int] = ()) -> Curated:
-    """Let the curator decide on episodes as it does by default, without a reference.
+    """Let the curator decide on episodes with its defaults and without a reference.
 
     Args:
         episodes: in any order.
-        margins: control steps; for each of them beginnings with that margin are made, too.
+        margins: control steps; beginnings are also made with each of these margins.
     """
     curation = Curation().fit([])
     decisions: dict[str, Decision] = {}
     prefixes: dict[int | None, dict[str, Span]] = {None: {}, **{m: {} for m in margins}}
     example: Episode | None = None
     for episode in episodes:
-        seen = curation.examine(episode)
-        decision = decisions[episode.id] = curation.judge(seen)
-        broke = seen.breaks.get(str(decision.evidence.get("decided_by")))
+        examination = curation.examine(episode)
+        decision = decisions[episode.id] = curation.judge(examination)
+        broke = examination.breaks.get(str(decision.evidence.get("decided_by")))
         if decision.verdict == "salvage":
             prefixes[None][episode.id] = decision.span
             if broke is not None and (example is None or episode.name < example.name):
@@ -77,29 +74,30 @@ def curate(episodes: Iterable[Episode], margins: Iterable[int] = ()) -> Curated:
                 kept = good_prefix(episode, at, margin / episode.rate_hz)
                 if kept is not None:
                     prefixes[margin][episode.id] = episode.span(*kept)
-            elif decision.verdict == "salvage":  # a spoilt end, which no margin changes
+            elif decision.verdict == "salvage":  # only an end is spoilt: no margin changes that
                 prefixes[margin][episode.id] = decision.span
     return Curated(decisions, prefixes, example)
 
 
-def facts_of(
+def compare_with_truth(
     curated: Curated,
     good: Mapping[str, bool],
     release_steps: Mapping[str, int],
     timelines: Mapping[str, Episode],
-) -> Row:
-    """Decisions against the truth.
+) -> JsonObject:
+    """Compare the decisions with the truth.
 
     Args:
         curated: the decisions.
-        good: id -> whether it succeeded.
-        release_steps: id -> step at which the gripper opened too early, where it did.
-        timelines: id -> episode, its stamps at least.
+        good: id -> whether the episode succeeded.
+        release_steps: id -> step at which the gripper opened too early, for episodes with one.
+        timelines: id -> episode with at least its stamps.
 
     Returns:
-        `verdicts`: of each how many episodes that succeeded and that failed; `decided_by`: how
-        many each scorer decided; `cut_minus_release`: last step that is kept of a salvaged
-        episode minus the step of its release, smallest, middle and largest.
+        `verdicts`: for each verdict the number of episodes that succeeded and that failed.
+        `decided_by`: the number of episodes that each scorer decided.
+        `cut_minus_release`: for salvaged episodes the last step that is kept minus the step of
+        the release: their number, and the smallest, middle and largest difference.
     """
     verdicts = {v: {"good": 0, "defective": 0} for v in VERDICTS}
     deciders: dict[str, int] = {}
@@ -112,32 +110,28 @@ def facts_of(
         for i, span in curated.prefixes.get(None, {}).items()
         if i in release_steps
     ]
+    difference = None
+    if late:
+        difference = {"n": len(late), "min": min(late), "median": median(late), "max": max(late)}
     return {
         "verdicts": verdicts,
         "decided_by": dict(sorted(deciders.items())),
-        "cut_minus_release": {
-            "n": len(late),
-            "min": min(late),
-            "median": median(late),
-            "max": max(late),
-        }
-        if late
-        else None,
+        "cut_minus_release": difference,
     }
 
 
 def phases_shown(
     bags: Iterable[tuple[str, Span | None]], timelines: Mapping[str, Episode]
 ) -> dict[str, dict[str, int]]:
-    """How much of each phase demonstrations show.
+    """Count how much of each phase demonstrations show.
 
     Args:
-        bags: ids, each with the span that is kept; None: all of it.
-        timelines: id -> episode, its phases at least.
+        bags: ids, each with the span that is kept; None for the whole episode.
+        timelines: id -> episode with at least its phases.
 
     Returns:
-        Phase -> how many of the `demonstrations` show it, in how many `steps`; empty where phases
-        are not known.
+        Phase -> the number of `demonstrations` that show it, and the number of `steps`. It is
+        empty if the phases are unknown.
     """
     parts = [(i, phase_steps(timelines[i], span) if i in timelines else None) for i, span in bags]
     shown: dict[str, dict[str, int]] = balance_of(parts).to_json()["shown"]

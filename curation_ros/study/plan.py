@@ -1,4 +1,4 @@
-"""The plan of a study: datasets, training sets, seeds, starts; all of it before anything runs."""
+"""The plan of a study: datasets, training sets, seeds and starts, fixed before anything runs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import yaml
 
@@ -16,9 +16,9 @@ from curation_ros.core.errors import ConfigError
 from curation_ros.core.scorers import SCORERS
 from curation_ros.study.terms import Term, parse_row
 
-#: What a stage is for. `screen` figures are for looking around: nothing is claimed from them.
+#: What a stage is for. Results of `screen` are for exploring; nothing is claimed from them.
 KINDS = ("protocol", "screen", "confirm")
-#: Most contrasts of a stage that confirms.
+#: Largest number of contrasts in a stage.
 MAX_CONTRASTS = 12
 
 
@@ -28,9 +28,9 @@ class Contrast:
 
     Attributes:
         a, b: training sets.
-        pool: whose.
-        variant: of the observations.
-        why: the question, in words.
+        pool: pool of both.
+        variant: variant of the observations.
+        why: the question that it answers.
     """
 
     a: str
@@ -45,16 +45,16 @@ class Stage:
     """Policies of some training sets, trained with some seeds, rolled out from some starts.
 
     Attributes:
-        name: of the stage.
+        name: name of the stage.
         kind: one of KINDS.
-        pools: contaminated datasets that training sets are made of.
-        variants: of the observations.
-        seeds: of the training; the same for every training set.
-        starts: of the rollouts, such as official:0:50; the same for every policy.
-        rows: training sets, in the order in which they are worked on.
-        contrasts: planned comparisons; training sets that these need are rows, too.
-        draw_seeds: seeds of each draw of a control that is named with its draw; draws share the
-            seeds out.
+        pools: contaminated datasets that training sets are taken from.
+        variants: variants of the observations.
+        seeds: training seeds, the same for every training set.
+        starts: start states of the rollouts, such as official:0:50, the same for every policy.
+        rows: training sets, in the order of the work.
+        contrasts: planned comparisons. Their training sets count as rows.
+        draw_seeds: number of training seeds for each named draw of a control. The draws divide
+            the seeds among them.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Stage:
     draw_seeds: int = 1
 
     def cells(self) -> list[tuple[str, str, str]]:
-        """(pool, variant, row) of all that is to be trained, in order."""
+        """(pool, variant, row) of every training, in order."""
         planned = [(p, v, r) for p in self.pools for v in self.variants for r in self.rows]
         for one in self.contrasts:
             planned += [(one.pool, one.variant, one.a), (one.pool, one.variant, one.b)]
@@ -88,22 +88,23 @@ class StudyPlan:
     """A study.
 
     Attributes:
-        name: of its folder.
-        question: in words.
+        name: name of the study and of its folder.
+        question: the question that it answers.
         reference: parameters of the collection of trusted demonstrations.
         pools: name -> parameters of the collection of a contaminated dataset.
-        stages: in order.
-        budget_steps: simulation steps that its rollouts may take.
-        max_steps: most commands of a rollout.
-        gives_up: end a rollout that is as good as lost, see `policy_node.rollouts.GiveUp`.
-        gradient_steps: of each training.
-        length: length control of the scorers, see `curation_ros.batch.audit.LENGTHS`.
-        length_value: its value.
-        scorers: audited, and ranked by.
-        keep_for_audit: how many the audit's table keeps.
-        selection_seed: orders equal scores, and draws the controls.
-        looks_before: earlier looks at the official starts, in words; a line each.
-        more: parameters of the collection of further clean demonstrations; none: none are there.
+        stages: its stages, in order.
+        budget_steps: simulation steps that all rollouts together may take.
+        max_steps: largest number of commands in a rollout.
+        gives_up: end rollouts that are lost early, see `policy_node.rollouts.GiveUp`.
+        gradient_steps: gradient steps of each training.
+        length: length control of the scorers, see `curation_ros.batch.audit_length.LENGTHS`.
+        length_value: value of the length control.
+        scorers: the scorers that are audited and that rows may name.
+        keep_for_audit: number of episodes that the audit keeps.
+        selection_seed: seed of ties and of the controls.
+        looks_before: earlier looks at results on the official starts, a line each.
+        more: parameters of the collection of further clean demonstrations; empty for none.
+        raw: the plan as it was written.
     """
 
     name: str
@@ -126,20 +127,20 @@ class StudyPlan:
 
     @property
     def hash(self) -> str:
-        """Of the whole plan, contrasts included."""
+        """Hash of the whole plan, including its contrasts."""
         return hashlib.sha256(json.dumps(self.raw, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
     def collections(self) -> dict[str, Mapping[str, Any]]:
-        """Parameters of all collections, by the names of their datasets."""
+        """Name of each dataset -> parameters of its collection."""
         more = {"more": self.more} if self.more else {}
         return {"reference": self.reference, **more, **self.pools}
 
     def only(self, names: Sequence[str]) -> StudyPlan:
-        """The plan with some of its stages, and the pools that these use; its hash stays.
+        """The plan with only some stages and the pools that they use; the hash stays the same.
 
         Raises:
-            ConfigError: if there is no such stage.
+            ConfigError: if a stage does not exist.
         """
         known = [stage.name for stage in self.stages]
         for name in names:
@@ -151,7 +152,7 @@ class StudyPlan:
         return replace(self, stages=stages, pools=pools)
 
     def terms(self, pool: str) -> set[Term]:
-        """Everything that the rows of a pool are made of."""
+        """All terms of the rows of a pool."""
         return {
             term
             for stage in self.stages
@@ -162,10 +163,10 @@ class StudyPlan:
 
 
 def read_plan(path: Path) -> StudyPlan:
-    """Read a study's YAML; `contrasts_file` of a stage is read from beside it.
+    """Read the YAML file of a study; `contrasts_file` of a stage is relative to its folder.
 
     Raises:
-        ConfigError: naming file and key.
+        ConfigError: naming the file and the key that is wrong.
     """
     raw = _read_yaml(path)
     for stage in raw.get("stages") or ():
@@ -182,10 +183,10 @@ def read_plan(path: Path) -> StudyPlan:
 
 
 def plan_from(raw: Mapping[str, Any]) -> StudyPlan:
-    """The plan that plain data describe.
+    """Make a plan from plain data.
 
     Raises:
-        ConfigError: if a key is unknown or missing, or a value makes no sense.
+        ConfigError: if a key is unknown or missing, or a value is wrong.
     """
     given = _checked(raw, StudyPlan, "plan", leave=("raw",))
     stages = []
@@ -214,60 +215,63 @@ def _check(plan: StudyPlan) -> None:
     if not plan.stages or not plan.pools:
         raise ConfigError("a study needs pools and stages")
     for name in {"reference", "more"} & set(plan.pools):
-        raise ConfigError(f"a pool cannot be called {name!r}: that is the name of a dataset")
+        raise ConfigError(f"a pool cannot be called {name!r}: another dataset has that name")
     for name in plan.scorers:
         if name not in SCORERS:
             raise ConfigError(f"no scorer {name!r}; there are {', '.join(SCORERS)}")
     names = [stage.name for stage in plan.stages]
     if len(set(names)) < len(names):
-        raise ConfigError(f"stages {names}: a name is there twice")
+        raise ConfigError(f"stages {names}: two of them have the same name")
     for stage in plan.stages:
         where = f"stage {stage.name!r}"
-        if stage.kind not in KINDS:
-            raise ConfigError(f"{where}: kind {stage.kind!r} is none of {', '.join(KINDS)}")
-        if not stage.seeds or len(set(stage.seeds)) < len(stage.seeds):
-            raise ConfigError(f"{where}: seeds {stage.seeds}: expected some, each once")
-        if len(stage.contrasts) > MAX_CONTRASTS:
-            raise ConfigError(
-                f"{where}: {len(stage.contrasts)} contrasts, at most {MAX_CONTRASTS} are planned"
-            )
-        if not 1 <= stage.draw_seeds <= len(stage.seeds):
-            raise ConfigError(
-                f"{where}: draw_seeds {stage.draw_seeds} of {len(stage.seeds)} seeds"
-            )
+        _check_stage(stage, where)
         for pool, _, row in stage.cells():
             if pool not in plan.pools:
                 raise ConfigError(f"{where}: no pool {pool!r}; there are {', '.join(plan.pools)}")
             for term in parse_row(row):
-                source = "more" if term.name == "more" else pool
-                if source not in plan.collections:
-                    raise ConfigError(f"{where}: {row!r}: the plan has no dataset {source!r}")
-                n = int(plan.collections[source]["episodes"])
-                if term.keep is not None and term.keep > n:
-                    raise ConfigError(f"{where}: {row!r} keeps more than the {n} of {source}")
-                if term.name in SCORERS and term.name not in plan.scorers:
-                    raise ConfigError(f"{where}: {row!r}: {term.name} is none of the scorers")
+                _check_term(plan, pool, term, f"{where}: {row!r}")
+
+
+def _check_stage(stage: Stage, where: str) -> None:
+    if stage.kind not in KINDS:
+        raise ConfigError(f"{where}: kind {stage.kind!r} is none of {', '.join(KINDS)}")
+    if not stage.seeds or len(set(stage.seeds)) < len(stage.seeds):
+        raise ConfigError(f"{where}: seeds {stage.seeds}: expected at least one, each only once")
+    if len(stage.contrasts) > MAX_CONTRASTS:
+        raise ConfigError(
+            f"{where}: {len(stage.contrasts)} contrasts, at most {MAX_CONTRASTS} are planned"
+        )
+    if not 1 <= stage.draw_seeds <= len(stage.seeds):
+        raise ConfigError(f"{where}: draw_seeds {stage.draw_seeds} of {len(stage.seeds)} seeds")
+
+
+def _check_term(plan: StudyPlan, pool: str, term: Term, where: str) -> None:
+    source = "more" if term.name == "more" else pool
+    if source not in plan.collections:
+        raise ConfigError(f"{where}: the plan has no dataset {source!r}")
+    n = int(plan.collections[source]["episodes"])
+    if term.keep is not None and term.keep > n:
+        raise ConfigError(f"{where} keeps more than the {n} of {source}")
+    if term.name in SCORERS and term.name not in plan.scorers:
+        raise ConfigError(f"{where}: {term.name} is none of the plan's scorers")
 
 
 def _expanded(text: str, where: str) -> list[str]:
-    """`knn@{12,16}` and `random@16#{0..9}` are several rows."""
+    """Expand `knn@{12,16}` and `random@16#{0..9}` to several rows."""
     if not isinstance(text, str):
         raise ConfigError(f"{where}: row {text!r:.60}: expected a text such as knn@16")
-    found = re.search(r"\{([^}]*)\}", text)
-    if not found:
+    braces = re.search(r"\{([^}]*)\}", text)
+    if not braces:
         parse_row(text)
         return [text]
-    span = re.fullmatch(r"\s*([0-9]+)\.\.([0-9]+)\s*", found[1])
+    limits = re.fullmatch(r"\s*([0-9]+)\.\.([0-9]+)\s*", braces[1])
     values = (
-        [str(k) for k in range(int(span[1]), int(span[2]) + 1)]
-        if span
-        else [v.strip() for v in found[1].split(",")]
+        [str(k) for k in range(int(limits[1]), int(limits[2]) + 1)]
+        if limits
+        else [v.strip() for v in braces[1].split(",")]
     )
-    return [
-        row
-        for value in values
-        for row in _expanded(text[: found.start()] + value + text[found.end() :], where)
-    ]
+    before, after = text[: braces.start()], text[braces.end() :]
+    return [row for value in values for row in _expanded(before + value + after, where)]
 
 
 def _names(value: Any, what: str) -> tuple[str, ...]:
@@ -276,11 +280,8 @@ def _names(value: Any, what: str) -> tuple[str, ...]:
     return tuple(value)
 
 
-Kind = TypeVar("Kind")
-
-
 def _checked(raw: Any, kind: type[Any], what: str, leave: Sequence[str] = ()) -> dict[str, Any]:
-    """A mapping that has all keys that a dataclass needs, and none that it does not know."""
+    """A mapping with all keys that a dataclass requires and none that it lacks."""
     if not isinstance(raw, Mapping):
         raise ConfigError(f"{what}: expected a mapping, found {raw!r:.60}")
     known = {f.name: f for f in fields(kind) if f.name not in leave}

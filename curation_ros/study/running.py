@@ -8,22 +8,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from curation_ros.batch.audit import read_episodes
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.errors import CurationError
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_all_episodes
 from curation_ros.files import append_line, named_errors, read_lines
-from curation_ros.study.curated import phases_alone
+from curation_ros.study.curated import timeline_of
+from curation_ros.study.datasets import check_starts, collect_datasets
 from curation_ros.study.plan import Stage, StudyPlan
-from curation_ros.study.pools import (
-    Pool,
-    TrainingSet,
-    check_starts,
-    collect_datasets,
-    score_pool,
-    training_set,
-)
+from curation_ros.study.pools import Pool, score_pool
 from curation_ros.study.terms import parse_row
+from curation_ros.study.training_sets import TrainingSet, training_set
 from curation_ros.study.units import Judge, PolicyUnit, RolloutUnit, Row, Work
 
 Said = Callable[[str], None]
@@ -131,15 +125,11 @@ def run_study(
         datasets, fact["units"] = collect_datasets(
             data, plan, jobs=jobs, backend=backend, said=said
         )
-    reference, problems = read_episodes(datasets["reference"])
-    if problems:
-        raise CurationError(f"reference: {'; '.join(problems)}")
-    timelines = {e.id: phases_alone(e) for e in reference}
+    reference = read_all_episodes(datasets["reference"], "reference")
+    timelines = {e.id: timeline_of(e) for e in reference}
     if "more" in datasets:
-        further, problems = read_episodes(datasets["more"])
-        if problems:
-            raise CurationError(f"more: {'; '.join(problems)}")
-        timelines |= {e.id: phases_alone(e) for e in further}
+        further = read_all_episodes(datasets["more"], "more")
+        timelines |= {e.id: timeline_of(e) for e in further}
     pools = {}
     with clock.measured("score and audit"):
         for name in plan.pools:

@@ -15,12 +15,13 @@ from curation_ros.batch.audit import PAPER
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.statistics import detection
 from curation_ros.dataset.dataset import Dataset
-from curation_ros.study.curated import curate, facts_of, phases_alone
+from curation_ros.study.curated import compare_with_truth, curate, timeline_of
 from curation_ros.study.plan import StudyPlan, plan_from
-from curation_ros.study.pools import POINTS_PER_PHASE, Pool, training_set
+from curation_ros.study.pools import POINTS_PER_PHASE, Pool
 from curation_ros.study.results import results
 from curation_ros.study.running import Cell, Study
 from curation_ros.study.terms import DECIDED
+from curation_ros.study.training_sets import training_set
 from curation_ros.study.units import Judge
 from sim_node.starts import start_names
 
@@ -197,13 +198,14 @@ def _pool(folder: Path, name: str, plan: StudyPlan, rng: np.random.Generator) ->
                 "notes": ["12 abstained: <why>"] if scorer == "entropy" else [],
             }
         )
-    curated, timelines, released = None, {}, {}
+    curated, timelines, curator = None, {}, {}
     if any(term.name in DECIDED for term in plan.terms(name)):
         carried = list(_carried(good, rng))
         margins = {t.margin for t in plan.terms(name) if t.margin is not None}
         curated = curate([episode for episode, _ in carried], margins)
-        timelines = {e.id: phases_alone(e) for e, _ in carried}
+        timelines = {e.id: timeline_of(e) for e, _ in carried}
         released = {e.id: at for e, at in carried if not good[e.id]}
+        curator = {"curator": compare_with_truth(curated, good, released, timelines)}
     return Pool(
         name=name,
         dataset=Dataset(folder / name, create=True),
@@ -225,7 +227,7 @@ def _pool(folder: Path, name: str, plan: StudyPlan, rng: np.random.Generator) ->
                 "mode": "shortest-reference", "value": None, "steps": 215, "needs": "reference",
             },
             "scoring_hash": "0" * 16,
-            **({"curator": facts_of(curated, good, released, timelines)} if curated else {}),
+            **curator,
         },
         timelines=timelines,
         curated=curated,

@@ -9,21 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from episodes import make_episode, make_reference
-from streams import record
 
-from curation_ros.batch.audit import (
-    PAPER,
-    Audit,
-    AuditSettings,
-    audit,
-    read_episodes,
-    read_labels,
-)
+from curation_ros.batch.audit import PAPER, Audit, AuditSettings, audit
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError, EpisodeError
 from curation_ros.core.scorers import SCORERS
 from curation_ros.core.statistics.detection import auroc, auroc_interval
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.labels import read_labels
 
 FAST = ("gripper_timing", "knn", "length")
 DRAWS = {"n_permutations": 199, "n_resamples": 200}
@@ -57,19 +50,6 @@ def _row(audited: Audit, scorer: str) -> dict[str, Any]:
 
 
 # --- labels -------------------------------------------------------------------------------------
-
-
-def test_labels_are_read_from_the_field_that_is_named(dataset: Dataset) -> None:
-    for episode, truth in {
-        "a": {"outcome": "succeeded", "defect": "none"},
-        "b": {"outcome": "succeeded", "defect": "early_release"},
-        "c": {"outcome": "failed"},
-        "d": {"outcome": "aborted", "defect": "none"},
-        "e": {"steps": 3},
-    }.items():
-        dataset.append_truth({"episode": episode, **truth})
-    assert read_labels(dataset, "success") == {"a": True, "b": True, "c": False}
-    assert read_labels(dataset, "defect") == {"a": True, "b": False, "d": True}
 
 
 def test_labels_turned_over_turn_over_every_figure_and_no_score(
@@ -390,18 +370,3 @@ def test_shortest_success_without_a_success_is_refused(
         dataset.append_truth({"episode": episode.id, "outcome": "failed", "defect": defect})
     with pytest.raises(CurationError, match="no episode of the dataset succeeded"):
         audit(dataset, episodes, settings=_settings(labels="defect", length="shortest-success"))
-
-
-def test_episodes_are_read_in_the_order_of_ids_and_the_unreadable_are_told(
-    dataset: Dataset, rng: np.random.Generator
-) -> None:
-    made = [make_episode(rng, 20, close_at=None) for _ in range(3)]
-    for episode in made:
-        record(dataset, episode)
-    broken = dataset.bag_path("broken")
-    broken.mkdir()
-    (broken / "broken_0.mcap").write_bytes(b"")
-    episodes, problems = read_episodes(dataset)
-    assert [e.id for e in episodes] == sorted(e.id for e in made)
-    assert len(problems) == 1
-    assert str(broken) in problems[0]

@@ -23,10 +23,11 @@ pytest.importorskip("torch", reason="torch is not installed")
 from curation_ros.cli.main import main  # noqa: E402 - needs LIBERO
 from curation_ros.dataset.dataset import Dataset  # noqa: E402 - as above
 from curation_ros.files import append_line  # noqa: E402 - as above
+from curation_ros.study.datasets import check_starts  # noqa: E402 - as above
 from curation_ros.study.plan import StudyPlan, plan_from  # noqa: E402 - as above
-from curation_ros.study.pools import check_starts, training_set  # noqa: E402 - as above
 from curation_ros.study.results import results  # noqa: E402 - as above
 from curation_ros.study.running import Study, run_study  # noqa: E402 - as above
+from curation_ros.study.training_sets import training_set  # noqa: E402 - as above
 
 MAX_STEPS = 5
 RAW: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Plans of studies: what they may say, and what is refused before an hour of work."""
+"""Plans of studies: what they may contain, and what is refused before any work is done."""
 
 from __future__ import annotations
 
@@ -84,13 +84,16 @@ def test_sets_of_contrasts_are_worked_on_and_none_twice() -> None:
         (lambda r: r.update(scorers=["knm"]), "no scorer 'knm'"),
         (lambda r: r.update(scorers="knn"), "scorers is 'knn', expected a list of names"),
         (lambda r: r["stages"][0].pop("seeds"), "stage: no key 'seeds'"),
-        (lambda r: r["stages"][0].update(seeds=[1, 1]), "expected some, each once"),
+        (lambda r: r["stages"][0].update(seeds=[1, 1]), "expected at least one, each only once"),
         (lambda r: r["stages"][0].update(kind="final"), "kind 'final' is none of protocol"),
         (lambda r: r["stages"][0].update(pools=["other"]), "no pool 'other'; there are paired"),
         (lambda r: r["stages"][0].update(rows=["knn@5"]), "keeps more than the 4 of paired"),
-        (lambda r: r["stages"][0].update(rows=["entropy@2"]), "entropy is none of the scorers"),
+        (
+            lambda r: r["stages"][0].update(rows=["entropy@2"]),
+            "entropy is none of the plan's scorers",
+        ),
         (lambda r: r["stages"][0].update(rows=[3]), "row 3: expected a text"),
-        (lambda r: r["stages"].append(r["stages"][0]), "a name is there twice"),
+        (lambda r: r["stages"].append(r["stages"][0]), "two of them have the same name"),
         (lambda r: r["stages"][0].update(contrasts=[{"a": "oracle"}]), "contrast: no key 'b'"),
         (lambda r: r["stages"][0].update(draw_seeds=4), "draw_seeds 4 of 3 seeds"),
         (lambda r: r["stages"][0].update(rows=["more@2"]), "the plan has no dataset 'more'"),

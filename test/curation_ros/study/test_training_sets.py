@@ -1,55 +1,19 @@
-"""Rows of a study that are what the curator decides: whole, salvaged, cut at random."""
+"""Training sets that rest on decisions of the curator: whole, salvaged, cut at random."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-from scenes import LIFT_AT, N_STEPS, RATE_HZ, RELEASE_AT, scene, without
+from made_pool import DROPS, MARGIN, MARGINS, pool_of, scenes_of
+from scenes import N_STEPS, RELEASE_AT, without
 
-from curation_ros.core.decision.salvage import DEFAULT_MARGIN_S
-from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import EpisodeError
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.files import append_line
-from curation_ros.study.curated import curate, facts_of, phases_alone
-from curation_ros.study.pools import Pool, TrainingSet, training_set
-
-DROPS = (LIFT_AT + 20, LIFT_AT + 40, LIFT_AT + 60)
-MARGIN = round(DEFAULT_MARGIN_S * RATE_HZ)
-MARGINS = (0, 5, MARGIN)
-
-
-def named(episode: Episode, k: int) -> Episode:
-    """With a name, and the noise without which a recording counts as frozen."""
-    rng = np.random.default_rng(k)
-    fields = dict(episode.fields)
-    for field in ("eef_position", "bowl_position", "plate_position", "joint_position"):
-        fields[field] = fields[field] + 1e-5 * rng.standard_normal(fields[field].shape)
-    return replace(episode, id=f"a-{k}", name=f"bowl-{k:04}", fields=fields)
-
-
-def scenes_of() -> list[Episode]:
-    """Two that succeed, and one for each of DROPS."""
-    broken = [scene(dropped_at=at, opened_at=at) for at in DROPS]
-    return [named(episode, k) for k, episode in enumerate([scene(), scene(), *broken])]
-
-
-def pool_of(folder: Path, episodes: Sequence[Episode], margins: Sequence[int] = MARGINS) -> Pool:
-    return Pool(
-        name="made",
-        dataset=Dataset(folder / "pool", create=True),
-        episodes=tuple(e.id for e in episodes),
-        names={e.id: e.name for e in episodes},
-        good={e.id: k < 2 for k, e in enumerate(episodes)},
-        scores={},
-        needs={},
-        timelines={e.id: phases_alone(e) for e in episodes},
-        curated=curate(episodes, margins),
-    )
+from curation_ros.study.pools import Pool
+from curation_ros.study.training_sets import TrainingSet, training_set
 
 
 @pytest.fixture
@@ -176,19 +140,6 @@ def test_phases_of_a_set_are_counted_within_the_spans(pool: Pool, reference: Dat
     assert "spans" not in training_set(pool, "decided", reference, 0).to_json(pool.timelines)
 
 
-def test_facts_are_decisions_against_the_truth(pool: Pool) -> None:
-    assert pool.curated is not None
-    released = {f"a-{k}": at for k, at in enumerate(DROPS, start=2)}
-    facts = facts_of(pool.curated, pool.good, released, pool.timelines)
-    assert facts["verdicts"]["keep"] == {"good": 2, "defective": 0}
-    assert facts["verdicts"]["salvage"] == {"good": 0, "defective": 3}
-    assert facts["verdicts"]["review"] == {"good": 0, "defective": 0}
-    assert facts["decided_by"] == {"object_coupling": 5}
-    late = {"n": 3, "min": -MARGIN, "median": -MARGIN, "max": -MARGIN}
-    assert facts["cut_minus_release"] == late
-    assert facts_of(pool.curated, pool.good, {}, pool.timelines)["cut_minus_release"] is None
-
-
 def test_without_poses_gripper_and_phase_decide_and_nothing_is_needed(
     tmp_path: Path, reference: Dataset
 ) -> None:
@@ -204,13 +155,6 @@ def test_a_beginning_that_is_too_short_with_a_margin_is_there_with_a_smaller_one
     pool = pool_of(tmp_path, scenes_of(), (0, 80))
     assert training_set(pool, "salvaged-0", reference, 0).n_salvaged == 3
     assert training_set(pool, "salvaged-80", reference, 0).n_salvaged < 3
-
-
-def test_an_example_is_the_first_by_name_of_those_that_broke(pool: Pool) -> None:
-    assert pool.curated is not None
-    assert pool.curated.example is not None
-    assert pool.curated.example.id == "a-2"
-    assert curate([scene()]).example is None
 
 
 def test_a_pool_that_the_curator_has_not_seen_is_named(pool: Pool, reference: Dataset) -> None:
