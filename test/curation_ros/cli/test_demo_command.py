@@ -1,56 +1,53 @@
-"""`curation demo`: what it selects, shows and claims; and the whole of it, small, on a graph."""
+"""`curation demo`: what it shows for each event, and the whole of it, small, on a graph."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from episodes import make_episode
-from streams import record
 
-from curation_ros.cli.demo import _compared, _Demo, _lead
-from curation_ros.core.decision.curation import Curation
-from curation_ros.core.decision.decision import Decision
+from curation_ros.cli.demo import JsonLines, Screen, compared
 from curation_ros.core.episode.findings import Finding
-from curation_ros.core.episode.status import (
-    EpisodeEvent,
-    Status,
-    alert_to_status,
-    decision_to_status,
-)
-from curation_ros.core.errors import CurationError
+from curation_ros.core.episode.status import alert_to_status, decision_to_status
 from curation_ros.dataset.dataset import Dataset
-from curation_ros.dataset.manifests import read_manifest
+from curation_ros.nodes.demo import comparisons
+from curation_ros.nodes.demo_events import (
+    EVERYTHING,
+    KEPT,
+    KEPT_AND_SALVAGED,
+    Alerted,
+    Decided,
+    DemoSettings,
+    Drawn,
+    Driving,
+    Finished,
+    Recording,
+    Selected,
+    Training,
+)
 
-ALL = ("everything", "kept", "kept-and-salvaged")
-DROPS_AT = 140
-
-
-def _demo(folder: Path, as_json: bool = False) -> _Demo:
-    return _Demo(argparse.Namespace(json=as_json), folder)
-
-
-def _demonstrated(folder: Path, *open_at: int, salvage: bool = True) -> dict[str, Decision]:
-    """What the demo leaves behind of such episodes, bags and decisions; decisions by name."""
-    rng = np.random.default_rng(5)
-    curation = Curation(
-        scorers=["object_coupling", "grip_consistency", "phase_events", "gripper_timing"],
-        salvage_margin_s=0.75 if salvage else None,
-    ).fit([])
-    dataset = Dataset(folder / "demonstrations", create=True)
-    decisions = {}
-    for k, step in enumerate(open_at):
-        episode = make_episode(rng, name=f"demo-{k}", open_at=step)
-        record(dataset, episode)
-        decisions[episode.name] = curation.decide(episode)
-        dataset.append_decision(decisions[episode.name])
-    return decisions
+ALL = (EVERYTHING, KEPT, KEPT_AND_SALVAGED)
+ALERT = Alerted(
+    alert_to_status(
+        "id", "demo-3", Finding("object-lost", "bowl left the effector at 8.50 s", (8_500, 8_700))
+    )
+)
+DECIDED = Decided(
+    decision_to_status(
+        episode_id="id",
+        name="demo-3",
+        verdict="salvage",
+        reason="it fell",
+        span=(0, 5),
+        revision=1,
+        scores={},
+    ),
+    {"alert_before_s": 2.34, "alert_before_end_s": 8.91},
+)
 
 
 def _result(successes: int, rollouts: int = 10) -> dict[str, Any]:
@@ -62,123 +59,80 @@ def _result(successes: int, rollouts: int = 10) -> dict[str, Any]:
     }
 
 
-# --- selecting ------------------------------------------------------------------------------
+def _selected(*salvaged_s: float) -> Selected:
+    return Selected({}, 2, 3, salvaged_s, {"object_coupling": 3})
 
 
-def test_three_selections_differ_by_what_was_discarded_and_salvaged(tmp_path: Path) -> None:
-    decisions = _demonstrated(tmp_path, -1, DROPS_AT, -1)
-    manifests = _demo(tmp_path).select()
-    assert tuple(manifests) == ALL
-    found = {
-        name: {e.name: e.span for e in read_manifest(path)[0].entries}
-        for name, path in manifests.items()
-    }
-    assert found["everything"] == {"demo-0": None, "demo-1": None, "demo-2": None}
-    assert found["kept"] == {"demo-0": None, "demo-2": None}
-    assert found["kept-and-salvaged"] == {**found["kept"], "demo-1": decisions["demo-1"].span}
+@pytest.fixture
+def screen(tmp_path: Path) -> Screen:
+    return Screen(tmp_path, DemoSettings())
 
 
-def test_selection_says_how_much_is_salvaged_and_what_decided(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def _text(capsys: pytest.CaptureFixture[str]) -> str:
+    return " ".join(capsys.readouterr().out.split())
+
+
+# --- on the screen --------------------------------------------------------------------------
+
+
+def test_alert_and_decision_are_rows(screen: Screen, capsys: pytest.CaptureFixture[str]) -> None:
+    screen.show(ALERT)
+    screen.show(DECIDED)
+    alert, decision = (" ".join(row.split()) for row in capsys.readouterr().out.splitlines()[:2])
+    assert alert == "demo-3 ALERT bowl left the effector at 8.50 s"
+    assert decision.startswith("demo-3 salvage it fell (alert 2.3 s ago, 8.9 s before the end")
+
+
+def test_each_step_begins_with_one_paragraph(
+    screen: Screen, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    decisions = _demonstrated(tmp_path, -1, DROPS_AT, -1)
-    _demo(tmp_path).select()
-    first_ns, last_ns = decisions["demo-1"].span
-    said = " ".join(capsys.readouterr().out.split())
-    assert "2 of 3 demonstrations are kept whole" in said
-    assert f"of 1 more the beginning is salvaged, {(last_ns - first_ns) / 1e9:.1f} s" in said
-    assert "object_coupling (3)" in said
+    for name, n in (("", 0), ("demo-1", 0), ("demo-1", 1)):
+        screen.show(Recording(name, n))
+    screen.show(_selected(8.25))
+    for step in (0, 100):
+        screen.show(Training(dict.fromkeys(ALL, step)))
+    for outcomes in ((), (True,), (True, False)):
+        screen.show(Driving(dict.fromkeys(ALL, outcomes)))
+    screen.close()
+    text = _text(capsys)
+    for heading in ("1. Demonstrations.", "2. Selection.", "3. Training.", "4. Test."):
+        assert text.count(heading) == 1
+    assert "trained on kept + salvaged: 1 succeeded" in text
 
 
-def test_without_anything_salvaged_there_is_no_third_selection(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_selection_is_told_in_counts(screen: Screen, capsys: pytest.CaptureFixture[str]) -> None:
+    screen.show(_selected(8.0, 8.25, 9.0))
+    text = _text(capsys)
+    assert "2 of 3 demonstrations are kept whole" in text
+    assert "The beginning of 3 more is salvaged, 8.2 s in the median" in text
+    assert "Decided by object_coupling (3)" in text
+
+
+def test_without_salvage_there_is_no_third_policy(
+    screen: Screen, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _demonstrated(tmp_path, -1, DROPS_AT, salvage=False)
-    demo = _demo(tmp_path)
-    assert tuple(demo.select()) == ALL[:2]
-    demo.draw()
-    assert demo.pictures == ()
-    demo.conclude({"everything": _result(0), "kept": _result(9)}, 60.0)
-    said = " ".join(capsys.readouterr().out.split())
-    assert "nothing is salvaged" in said
-    assert "trained on kept + salvaged nothing was salvaged, so there is no such policy" in said
-    assert "kept + salvaged against" not in said
-    assert "picture" not in said
+    screen.show(_selected())
+    screen.show(Drawn(()))
+    screen.show(Finished({EVERYTHING: _result(0), KEPT: _result(9)}))
+    text = _text(capsys)
+    assert "Nothing is salvaged" in text
+    assert "trained on kept + salvaged no policy, because nothing was salvaged" in text
+    assert "kept + salvaged against" not in text
+    assert "picture" not in text
 
 
-def test_nothing_kept_ends_the_demo(tmp_path: Path) -> None:
-    _demonstrated(tmp_path, DROPS_AT, DROPS_AT)
-    with pytest.raises(CurationError, match="kept nothing"):
-        _demo(tmp_path).select()
-
-
-def test_the_picture_is_of_the_first_that_was_salvaged(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    _demonstrated(tmp_path, -1, DROPS_AT, DROPS_AT - 5)
-    demo = _demo(tmp_path)
-    demo.draw()
-    assert demo.pictures == (tmp_path / "salvaged.png", tmp_path / "salvaged.svg")
-    assert demo.pictures[0].stat().st_size > 0
-    svg = demo.pictures[1].read_text()
-    assert "demo-1: salvage" in svg
-
-
-# --- what is shown --------------------------------------------------------------------------
-
-
-def test_alert_and_decision_are_rows_of_the_table(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_missing_module_of_the_picture_is_named(
+    screen: Screen, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    lost = Finding("object-lost", "bowl left the effector at 8.50 s in LIFT", (8_500, 8_700))
-    demo = _demo(tmp_path)
-    bar = demo._progress()
-    demo._show_alert(bar, alert_to_status("id", "demo-3", lost))
-    decision = decision_to_status(
-        episode_id="id",
-        name="demo-3",
-        verdict="salvage",
-        reason="it fell",
-        span=(0, 5),
-        revision=1,
-        scores={},
-    )
-    demo._show_decision(bar, decision, {"alert_before_s": 2.34, "alert_before_end_s": 8.91})
-    alert, told = (" ".join(row.split()) for row in capsys.readouterr().out.splitlines()[:2])
-    assert alert == "demo-3 ALERT bowl left the effector at 8.50 s in LIFT"
-    assert told.startswith("demo-3 salvage it fell (alert 2.3 s ago, 8.9 s before the end")
+    screen.show(Drawn((), missing="matplotlib"))
+    assert "it needs matplotlib: pip install '.[report]'" in _text(capsys)
 
 
-def test_an_alert_leads_by_the_wall_clock_and_by_the_clock_of_the_episode() -> None:
-    start_ns = 1_000_000_000_000
-    alert = Status(2, "demo-1", "object-lost", "id", {"span_end": "8750000000"})
-    end = EpisodeEvent("id", "demo-1", "ended", start_ns, start_ns + 17_450_000_000)
-    assert _lead(alert, 2.5, end) == {"alert_before_s": 2.5, "alert_before_end_s": 8.7}
-    assert _lead(alert, 2.5, None) == {"alert_before_s": 2.5}
-
-
-@pytest.mark.parametrize(
-    ("kept", "everything", "said"),
-    [
-        (10, 0, "kept against everything: better (p = 1.1e-05"),
-        (0, 10, "kept against everything: WORSE, it did harm here (p = 1.1e-05"),
-        # Below 0.05, but there are two comparisons.
-        (10, 5, "kept against everything: no difference is shown"),
-        (3, 3, "kept against everything: no difference is shown"),
-    ],
-)
-def test_no_more_is_claimed_than_the_counts_can_bear(
-    kept: int, everything: int, said: str
+def test_results_are_compared(
+    screen: Screen, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    results = {"kept": _result(kept), "everything": _result(everything)}
-    assert _compared("kept", "everything", results).startswith(said)
-
-
-def test_the_end_compares_with_everything_and_with_what_was_kept(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    demo = _demo(tmp_path)
-    demo.pictures = (tmp_path / "salvaged.png", tmp_path / "salvaged.svg")
-    demo.conclude(dict(zip(ALL, map(_result, (0, 8, 9)), strict=True)), 60.0)
+    screen.show(Drawn((tmp_path / "salvaged.png", tmp_path / "salvaged.svg")))
+    screen.show(Finished(dict(zip(ALL, map(_result, (0, 8, 9)), strict=True))))
     out = capsys.readouterr().out
     lines = [" ".join(line.split()) for line in out.splitlines()]
     assert [line for line in lines if line.startswith("trained on")] == [
@@ -190,6 +144,47 @@ def test_the_end_compares_with_everything_and_with_what_was_kept(
     assert "kept against everything: better" in flat
     assert "kept + salvaged against kept: no difference is shown" in flat
     assert f"{tmp_path}/salvaged.png" in "".join(out.split())
+
+
+@pytest.mark.parametrize(
+    ("kept", "everything", "text"),
+    [
+        (10, 0, "kept against everything: better (p = 1.1e-05"),
+        (0, 10, "kept against everything: WORSE: curation did harm here (p = 1.1e-05"),
+        (10, 5, "kept against everything: no difference is shown"),
+    ],
+)
+def test_comparison_claims_no_more_than_the_counts_show(
+    kept: int, everything: int, text: str
+) -> None:
+    [one] = comparisons({KEPT: _result(kept), EVERYTHING: _result(everything)})
+    assert compared(one).startswith(text)
+
+
+# --- as JSON --------------------------------------------------------------------------------
+
+
+def test_json_has_a_line_per_alert_decision_result_and_picture(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lines = JsonLines()
+    events = (
+        Recording("demo-3", 0),
+        ALERT,
+        DECIDED,
+        _selected(),
+        Drawn((Path("a.png"),)),
+        Training({KEPT: 1}),
+        Driving({KEPT: ()}),
+        Finished({KEPT: _result(9)}),
+    )
+    for event in events:
+        lines.show(event)
+    alert, decision, result, picture = map(json.loads, capsys.readouterr().out.splitlines())
+    assert (alert["alert"], alert["episode"], alert["name"]) == ("object-lost", "id", "demo-3")
+    assert (decision["verdict"], decision["alert_before_s"]) == ("salvage", 2.34)
+    assert result == {"condition": KEPT, **_result(9)}
+    assert picture == {"picture": "a.png"}
 
 
 # --- the whole ------------------------------------------------------------------------------
