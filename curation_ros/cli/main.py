@@ -21,6 +21,7 @@ COMMANDS = {
     "export": ("curation_ros.cli.export", "write keep.json, CSV or Parquet"),
     "override": ("curation_ros.cli.override", "a person's decision on an episode"),
     "index": ("curation_ros.cli.index", "list a dataset; rebuild its index from its files"),
+    "scorers": ("curation_ros.cli.scorers", "list scorers, ours and those of other packages"),
     "self-check": ("curation_ros.cli.self_check", "prove that no score depends on labels"),
     "recover": ("curation_ros.cli.recover", "save what a damaged bag still holds"),
     "record": ("curation_ros.cli.record", "start and stop a recorder that is driven by hand"),

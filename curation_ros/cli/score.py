@@ -26,7 +26,6 @@ from curation_ros.core.decision.rules import given_params
 from curation_ros.core.decision.ties import TieKey
 from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.errors import ConfigError, CurationError
-from curation_ros.core.scorers import SCORERS
 from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.layout import home_of, is_dataset
@@ -47,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_reference(parser)
     parser.add_argument(
         "--scorers",
-        help=f"comma separated, beside the one that decides: {', '.join(SCORERS)}",
+        help="comma separated, in addition to the one that decides; see `curation scorers`",
     )
     add_rule(parser, default="that of the config")
     parser.add_argument("--rule-scorer", help="the scorer that decides; default: of the config")

@@ -16,7 +16,7 @@ from curation_ros.core.decision.selection import Candidate, check_selects, selec
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import ConfigError, CurationError
-from curation_ros.core.scorers import SCORERS
+from curation_ros.core.scorers import find_scorer, is_scorer
 from curation_ros.core.types import Span
 from curation_ros.dataset.dataset import Dataset
 
@@ -69,7 +69,7 @@ def save_selection(
         _candidate(bag.name, names, scorer, decided.get(bag.name), scored.get(bag.name))
         for bag in bags
     ]
-    resolution = SCORERS[scorer]().resolution if scorer in SCORERS else 0.0
+    resolution = find_scorer(scorer)().resolution if is_scorer(scorer) else 0.0
     chosen = select(candidates, ruler, seed=seed, tie=dataset.tie(seed), resolution=resolution)
     now = datetime.now(timezone.utc)
     basis = scored if ruler.reads_scores else decided
@@ -105,7 +105,7 @@ def _check_scored(dataset: Dataset, scorer: str, scored: Mapping[str, Decision |
     """
     if any(d is not None and scorer in d.scores for d in scored.values()):
         return
-    is_fitted = scorer in SCORERS and SCORERS[scorer].needs == "reference"
+    is_fitted = is_scorer(scorer) and find_scorer(scorer).needs == "reference"
     raise ConfigError(
         f"dataset {dataset.path}: no episode has a logged score of {scorer!r}: run "
         f"curation score {dataset.path} --write --scorers {scorer}"

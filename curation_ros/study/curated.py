@@ -13,7 +13,7 @@ from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import VERDICTS, Decision
 from curation_ros.core.decision.salvage import good_prefix
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.scorers import SCORERS
+from curation_ros.core.scorers import find_scorer, is_scorer
 from curation_ros.core.types import JsonObject, Span
 
 
@@ -46,7 +46,7 @@ class Curated:
     def needs(self, ids: Iterable[str]) -> set[str]:
         """What the scorers need that decided on these episodes."""
         deciders = {str(self.decisions[i].evidence.get("decided_by", "")) for i in ids}
-        return {SCORERS[name].needs for name in deciders if name in SCORERS}
+        return {find_scorer(name).needs for name in deciders if is_scorer(name)}
 
 
 def curate(episodes: Iterable[Episode], margins: Iterable[int] = ()) -> Curated:

@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from curation_ros.core.errors import ConfigError
-from curation_ros.core.scorers import SCORERS
+from curation_ros.core.scorers import SCORERS, find_scorer, is_scorer
 from curation_ros.study.terms import Term, parse_row
 
 #: What a stage is for. Results of `screen` are for exploring; nothing is claimed from them.
@@ -217,8 +217,7 @@ def _check(plan: StudyPlan) -> None:
     for name in {"reference", "more"} & set(plan.pools):
         raise ConfigError(f"a pool cannot be called {name!r}: another dataset has that name")
     for name in plan.scorers:
-        if name not in SCORERS:
-            raise ConfigError(f"no scorer {name!r}; there are {', '.join(SCORERS)}")
+        find_scorer(name)
     names = [stage.name for stage in plan.stages]
     if len(set(names)) < len(names):
         raise ConfigError(f"stages {names}: two of them have the same name")
@@ -252,7 +251,7 @@ def _check_term(plan: StudyPlan, pool: str, term: Term, where: str) -> None:
     n = int(plan.collections[source]["episodes"])
     if term.keep is not None and term.keep > n:
         raise ConfigError(f"{where} keeps more than the {n} of {source}")
-    if term.name in SCORERS and term.name not in plan.scorers:
+    if is_scorer(term.name) and term.name not in plan.scorers:
         raise ConfigError(f"{where}: {term.name} is none of the plan's scorers")
 
 

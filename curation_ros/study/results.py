@@ -11,7 +11,7 @@ from statistics import mean
 from typing import Any
 
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.scorers import SCORERS
+from curation_ros.core.scorers import find_scorer, is_scorer
 from curation_ros.core.statistics.rank_correlation import rank_correlation_exact
 from curation_ros.core.statistics.seeds import deviations, modes, seed_counts
 from curation_ros.core.statistics.significance import holm
@@ -189,10 +189,10 @@ def _row(
     ]
     pool = study.pools[cell.pool]
     terms = parse_row(cell.row)
-    scorer = next((t.name for t in terms if t.name in SCORERS), "")
+    scorer = next((t.name for t in terms if is_scorer(t.name)), "")
     audited: Mapping[str, Any] = next((r for r in pool.audited if r["scorer"] == scorer), {})
     # What is ranked by: the score under length control, but for the baseline of length itself.
-    raw = scorer in SCORERS and not SCORERS[scorer].length_controlled
+    raw = is_scorer(scorer) and not find_scorer(scorer).length_controlled
     row: Row = {
         "variant": cell.variant,
         **_sets(cell, study.timelines),

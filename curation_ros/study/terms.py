@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 
 from curation_ros.core.errors import ConfigError
-from curation_ros.core.scorers import SCORERS
+from curation_ros.core.scorers import is_scorer, scorer_names
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,8 @@ def parse_row(text: str) -> tuple[Term, ...]:
 
 def _parse_term(part: str, text: str) -> Term:
     match = _TERM.fullmatch(part)
-    if not match or (match[1] not in SCORERS and match[1] not in CONTROLS):
-        known = ", ".join((*CONTROLS, *SCORERS))
+    if not match or (match[1] not in CONTROLS and not is_scorer(match[1])):
+        known = ", ".join((*CONTROLS, *scorer_names()))
         raise ConfigError(f"training set {text!r}: unknown term {part!r}; known are {known}")
     name = match[1]
     margin, keep, draw, wrong = (None if m is None else int(m) for m in match.groups()[1:])

@@ -16,7 +16,7 @@ import numpy as np
 from curation_ros.core.decision.ties import ranking, tie_key
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import EpisodeError
-from curation_ros.core.scorers import SCORERS
+from curation_ros.core.scorers import is_scorer
 from curation_ros.core.types import JsonObject, Span
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.labels import read_labels
@@ -184,7 +184,7 @@ def _add_term(
     else:
         ids, content.tied = _kept(pool, term, seed)
         content.add_parts(dict.fromkeys(ids))
-        if term.name in SCORERS:
+        if is_scorer(term.name):
             content.needs |= set(pool.needs[term.name])
         else:
             content.needs.add(CONTROLS[term.name].needs)

@@ -21,7 +21,7 @@ from curation_ros.core.evidence.baseline import Baseline
 from curation_ros.core.evidence.checks import check_episode
 from curation_ros.core.evidence.gripper import gripper_findings
 from curation_ros.core.evidence.length_control import LengthControl
-from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, Look, PoolScorer, Scorer
+from curation_ros.core.scorers import DEFAULT_SCORERS, Look, PoolScorer, Scorer, find_scorer
 from curation_ros.core.scorers.features import phase_name
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class Curation:
         """Check and store the configuration.
 
         Args:
-            scorers: names in SCORERS; each scores every episode.
+            scorers: names of scorers (`curation scorers` lists them); each scores every episode.
             rule: name in RULES.
             rule_scorer: the one of `scorers` that decides.
             length: mode of the length control.
@@ -105,8 +105,7 @@ class Curation:
         if not self.scorers or len(set(self.scorers)) < len(self.scorers):
             raise ConfigError(f"scorers {list(self.scorers)}: expected names, each once")
         for name in (*self.scorers, *self.scorer_params):
-            if name not in SCORERS:
-                raise ConfigError(f"no scorer {name!r}; there are {', '.join(SCORERS)}")
+            find_scorer(name)
         for name in self.scorer_params:
             if name not in self.scorers:
                 raise ConfigError(
@@ -123,7 +122,7 @@ class Curation:
 
     def _make_scorer(self, name: str) -> Scorer:
         params = self.scorer_params.get(name, {})
-        known = SCORERS[name]().params()
+        known = find_scorer(name)().params()
         for key, value in params.items():
             if key not in known:
                 known_names = ", ".join(known) or "none"
@@ -134,7 +133,7 @@ class Curation:
                 raise ConfigError(
                     f"scorer {name!r}: {key} is {value!r}, expected one like {known[key]!r}"
                 )
-        scorer = SCORERS[name](**params)
+        scorer = find_scorer(name)(**params)
         scorer.check_params()
         return scorer
 
