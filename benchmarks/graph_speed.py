@@ -1,4 +1,4 @@
-"""Control steps a second on the graph: the expert and a policy in lockstep, all nodes running."""
+"""Control steps per second on the graph: the expert, and a policy in lockstep."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from decision_latency import record
+from recorded import record
+from rows import row
 
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.manifests import read_selected, save_selection
@@ -20,61 +21,52 @@ COMMAND = "python benchmarks/run.py graph_speed"
 N_EPISODES = 8
 
 
+def expert_rate(folder: Path, dataset: Dataset) -> float:
+    """Steps per second while the expert's demonstrations are recorded and curated."""
+    reference = record(folder / "reference", episodes=6, seed=101)
+    domain = Domain()
+    with Nodes(domain, folder / "logs") as nodes:
+        nodes.start("recorder", {"dataset": dataset.path})
+        nodes.start("curator", {"dataset": dataset.path, "reference": [reference]})
+        nodes.start(
+            "sim_node",
+            {"dataset": dataset.path, "episodes": N_EPISODES, "wait_for": ["recorder", "curator"]},
+        )
+        # The clock starts at the end of the first episode, to leave the start-up out.
+        while not dataset.truth_log.path.exists():
+            time.sleep(0.02)
+        began_s = time.monotonic()
+        nodes.wait("sim_node", 300.0)
+        elapsed_s = time.monotonic() - began_s
+    domain.close()
+    steps: int = sum(t["steps"] for t in list(dataset.truth().values())[1:])
+    return steps / elapsed_s
+
+
+def policy_rate(folder: Path, dataset: Dataset) -> float:
+    """Steps per second of a policy in lockstep; the first rollout is left out."""
+    manifest, _ = save_selection(dataset, rule="all", name="all")
+    policy = train(read_selected(manifest, dataset), seed=0, steps=500).policy
+    policy.save(folder / "policy")
+    ends_s, steps = [], 0
+    for rollout in evaluate_on_graph(
+        folder / "policy", policy.id, "generated:3:5", log_folder=folder / "logs"
+    ):
+        ends_s.append(time.monotonic())
+        steps += rollout["steps"] if len(ends_s) > 1 else 0
+    return steps / (ends_s[-1] - ends_s[0])
+
+
 def run() -> list[dict[str, Any]]:
-    """Measure; a row a figure."""
+    """Measure and return the rows."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        reference = record(folder / "reference", episodes=6, seed=101)
-        domain = Domain()
-        dataset = folder / "live"
-        with Nodes(domain, folder / "logs") as nodes:
-            nodes.start("recorder", {"dataset": dataset})
-            nodes.start("curator", {"dataset": dataset, "reference": [reference]})
-            nodes.start(
-                "sim_node",
-                {"dataset": dataset, "episodes": N_EPISODES, "wait_for": ["recorder", "curator"]},
-            )
-            began_s = _first_episode(dataset)
-            nodes.wait("sim_node", 300.0)
-            expert_s = time.monotonic() - began_s
-        domain.close()
-        # The first episode started the watch.
-        expert_steps = sum(t["steps"] for t in list(Dataset(dataset).truth().values())[1:])
-        manifest, _ = save_selection(Dataset(dataset), rule="all", name="all")
-        policy = train(read_selected(manifest, Dataset(dataset)), seed=0, steps=500).policy
-        policy.save(folder / "policy")
-        stamps = []
-        steps = 0
-        for row in evaluate_on_graph(
-            folder / "policy", policy.id, "generated:3:5", log_folder=folder / "logs"
-        ):
-            stamps.append(time.monotonic())
-            steps += row["steps"] if len(stamps) > 1 else 0
-        driven_s = stamps[-1] - stamps[0]
-    rows = (
-        ("graph steps, expert, sim + recorder + curator", expert_steps / expert_s),
-        ("graph steps, policy in lockstep, sim + policy_node", steps / driven_s),
-    )
+        dataset = Dataset(folder / "live", create=True)
+        expert, policy = expert_rate(folder, dataset), policy_rate(folder, dataset)
     return [
-        {
-            "name": name,
-            "value": value,
-            "unit": "steps/s",
-            "against": "",
-            "ratio": None,
-            "target": None,
-            "holds": None,
-            "command": COMMAND,
-        }
-        for name, value in rows
+        row("graph steps, expert, sim + recorder + curator", expert, "steps/s", COMMAND),
+        row("graph steps, policy in lockstep, sim + policy_node", policy, "steps/s", COMMAND),
     ]
-
-
-def _first_episode(dataset: Path) -> float:
-    """Wait for the first episode to end; start-up is another figure."""
-    while not Dataset(dataset, create=True).truth_log.path.exists():
-        time.sleep(0.02)
-    return time.monotonic()
 
 
 if __name__ == "__main__":

@@ -23,11 +23,12 @@ from typing import Any
 import numpy as np
 import rclpy
 import rclpy.context
-from decision_latency import record
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from mcap.reader import make_reader
 from rclpy.executors import SingleThreadedExecutor
+from recorded import record
+from rows import row
 from sensor_msgs.msg import JointState
 
 from curation_ros.core.episode.phases import PHASES
@@ -86,16 +87,14 @@ def run() -> list[dict[str, Any]]:
         ):
             is_aim = (name, part) == ("lockstep overhead a step", "median")
             rows.append(
-                {
-                    "name": f"{name}, {part}",
-                    "value": value,
-                    "unit": "ms",
-                    "against": "",
-                    "ratio": None,
-                    "target": f"< {TARGET_MS:g} ms" if is_aim else None,
-                    "holds": value < TARGET_MS if is_aim else None,
-                    "command": COMMAND,
-                }
+                row(
+                    f"{name}, {part}",
+                    value,
+                    "ms",
+                    COMMAND,
+                    target=f"< {TARGET_MS:g} ms" if is_aim else None,
+                    holds=value < TARGET_MS if is_aim else None,
+                )
             )
     return rows
 

@@ -2,10 +2,10 @@
 
     python benchmarks/paper_data.py FOLDER
 
-makes FOLDER/reference (50 clean demonstrations), FOLDER/independent (16 clean and 64 early
-releases, a start state each) and FOLDER/paired (the same with the defective ones on the starts of
-the clean ones). What is there already is left alone. No start state is used twice among them, and
-none is an official one.
+makes FOLDER/reference (50 clean demonstrations), FOLDER/independent (16 clean demonstrations and
+64 early releases, each from another start state) and FOLDER/paired (the same numbers, with the
+early releases from the start states of the clean ones). Datasets that exist are left alone. No
+two datasets share a start state, and none uses an official one.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from recorded import record
+
 from curation_ros.dataset.dataset import Dataset
-from curation_ros.nodes.processes import Domain, Nodes
 
 _CONTAMINATED: dict[str, Any] = {"episodes": 80, "contamination": 0.8, "defect": "early_release"}
 DATASETS: dict[str, dict[str, Any]] = {
@@ -26,26 +27,16 @@ DATASETS: dict[str, dict[str, Any]] = {
 _PATIENCE_S = 3600.0
 
 
-def record(folder: Path, parameters: dict[str, Any]) -> Path:
-    """Record one dataset, if it is not there; returns its folder."""
-    if Dataset(folder, create=True).truth_log.lines():
-        return folder
-    domain = Domain()
-    with Nodes(domain, folder / "logs") as nodes:
-        nodes.start("recorder", {"dataset": folder})
-        nodes.start("sim_node", {"dataset": folder, "wait_for": ["recorder"], **parameters})
-        nodes.wait("sim_node", _PATIENCE_S)
-    domain.close()
-    return folder
-
-
 def main(arguments: list[str]) -> int:
-    """Record what is missing."""
+    """Record the datasets that are missing."""
     if len(arguments) != 1:
         print(__doc__)
         return 2
     for name, parameters in DATASETS.items():
-        print(record(Path(arguments[0]) / name, parameters), flush=True)
+        folder = Path(arguments[0]) / name
+        if not Dataset(folder, create=True).truth_log.lines():
+            record(folder, patience_s=_PATIENCE_S, **parameters)
+        print(folder, flush=True)
     return 0
 
 

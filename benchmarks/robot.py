@@ -28,7 +28,13 @@ def stamped(data: bytes, stamp_ns: int) -> bytes:
 
 
 class Robot:
-    """Publishers for the topics of a map, the `episode` topic, and what comes back."""
+    """Publishes the topics of a map and the `episode` topic, and keeps decisions and states.
+
+    Attributes:
+        outputs: topic -> its publisher.
+        decisions: episode -> time of arrival (monotonic clock, s) and the decision.
+        recorder: episode -> state of the recorder.
+    """
 
     def __init__(self, environment: Mapping[str, str], topics: Mapping[str, str]) -> None:
         """Join the graph; use in a `with` block."""
@@ -65,11 +71,15 @@ class Robot:
         self._context.try_shutdown()
 
     def tell(self, event: EpisodeEvent) -> None:
-        """Say where an episode starts or ends."""
+        """Publish the start or the end of an episode."""
         self._episode.publish(array_to_ros([event_to_status(event)], event.start_ns))
 
     def until(self, is_true: Callable[[], bool], what: str) -> None:
-        """Spin until something is so.
+        """Spin until a condition holds.
+
+        Args:
+            is_true: the condition.
+            what: name of the condition for the error.
 
         Raises:
             TimeoutError: after a minute.
@@ -81,7 +91,7 @@ class Robot:
                 raise TimeoutError(what)
 
     def wait_for_subscribers(self, n: int) -> None:
-        """Wait until each topic has this many."""
+        """Wait until each topic has `n` subscribers."""
         everything = (self._episode, *self.outputs.values())
         self.until(
             lambda: all(p.get_subscription_count() >= n for p in everything),

@@ -1,4 +1,4 @@
-"""Runs every benchmark and writes benchmarks/results.json: a row a figure."""
+"""Runs benchmarks and writes their rows to benchmarks/results.json."""
 
 from __future__ import annotations
 
@@ -27,7 +27,11 @@ BENCHMARKS = (
 
 
 def main(names: list[str]) -> int:
-    """Run the named benchmarks, or all; rows of the others stay as they are."""
+    """Run the named benchmarks, or all; rows of the others stay as they are.
+
+    Returns:
+        The exit code: 0, or 2 if a name is unknown.
+    """
     path = Path(__file__).with_name("results.json")
     old = json.loads(path.read_text())["rows"] if path.exists() else []
     fresh = []

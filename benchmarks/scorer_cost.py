@@ -1,8 +1,8 @@
-"""What each scorer costs on an episode of 350 steps: 14 columns of state, 4 of action.
+"""Time per scorer on an episode of 350 steps, with 14 columns of state and 4 of action.
 
-The episodes are the sample demonstration, stretched to 350 steps, with other starts and a little
-noise; scorers that learn are fitted on 50 of them. The best of several passes counts, as other
-work on the machine only adds.
+The episodes are copies of the sample demonstration, stretched to 350 steps, with other starts and
+noise. Scorers that learn are fitted on 50 of them. The best of several passes counts, because
+other work on the machine only adds time.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rows import row
 
 from curation_ros.bags.reader import read_episode
 from curation_ros.batch.audit import PAPER
@@ -36,7 +37,7 @@ def episodes(n: int, rng: np.random.Generator) -> list[Episode]:
         fields = {name: values[rows] for name, values in sample.fields.items()}
         noise = 0.01 * rng.standard_normal(fields["twist"].shape)
         fields["twist"] = fields["twist"] + noise
-        # What is held moves as the effector does, and another start is one of all there is.
+        # A held object moves with the effector, and another start moves everything.
         moved = np.cumsum(noise * 0.1, axis=0) + rng.uniform(-0.1, 0.1, 3)
         for name in ("eef_position", "bowl_position", "plate_position"):
             fields[name] = fields[name] + moved
@@ -48,7 +49,7 @@ def episodes(n: int, rng: np.random.Generator) -> list[Episode]:
 
 
 def cost_us(scorers: Sequence[Scorer], scored: Sequence[Episode]) -> float:
-    """Microseconds an episode that nobody has looked at before."""
+    """Microseconds per episode; each is a fresh copy, so that nothing is cached."""
     best = float("inf")
     for _ in range(_N_PASSES):
         fresh = [replace(episode) for episode in scored]
@@ -61,7 +62,7 @@ def cost_us(scorers: Sequence[Scorer], scored: Sequence[Episode]) -> float:
 
 
 def run() -> list[dict[str, Any]]:
-    """Measure; a row a figure."""
+    """Measure and return the rows."""
     made = episodes(_N_FITTED + _N_SCORED, np.random.default_rng(0))
     fitted = {name: kind().fit(made[:_N_FITTED]) for name, kind in SCORERS.items()}
     scored = made[_N_FITTED:]
@@ -69,16 +70,7 @@ def run() -> list[dict[str, Any]]:
     costs = {f"cost of {name}": cost_us([scorer], scored) for name, scorer in fitted.items()}
     costs["cost of the seven scorers of the paper"] = cost_us(paper, scored)
     return [
-        {
-            "name": f"{name}, episode of {N_STEPS} steps",
-            "value": value,
-            "unit": "us",
-            "against": "",
-            "ratio": None,
-            "target": None,
-            "holds": None,
-            "command": COMMAND,
-        }
+        row(f"{name}, episode of {N_STEPS} steps", value, "us", COMMAND)
         for name, value in costs.items()
     ]
 
