@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from curation_ros.bags.cdr import CdrDecoder
@@ -21,7 +20,7 @@ from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import joints_to_ros, single_from_ros, twist_to_ros
 from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import LATCHED, MAPPED
-from curation_ros.nodes.spinning import run
+from curation_ros.nodes.spinning import WorkingNode, run
 from curation_ros.nodes.subscriptions import MappedSubscriptions
 from policy_node.controller import PolicyController
 from policy_node.observation import PHASE
@@ -33,7 +32,7 @@ PARAMETERS = (
 )
 
 
-class PolicyNode(Node):
+class PolicyNode(WorkingNode):
     """Collects the fields that the policy sees; when all have one stamp, it answers."""
 
     def __init__(self) -> None:
@@ -67,7 +66,7 @@ class PolicyNode(Node):
         if self._health.due(now_s):
             problems = [self._problem] if self._problem else []
             problems += self._mapped.check(running=self._episode is not None)
-            self._health.publish(now_s, problems, self._mapped.seen())
+            self._health.publish(now_s, problems, self._mapped.publishers_found())
         return False
 
     def close(self) -> None:

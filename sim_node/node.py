@@ -23,8 +23,8 @@ from curation_ros.core.episode.status import (
 )
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.nodes.delivery import deliver
+from curation_ros.nodes.discovery import Discovery
 from curation_ros.nodes.health import Health, publishers_found
-from curation_ros.nodes.matching import Matching
 from curation_ros.nodes.messages import (
     array_to_ros,
     message_type,
@@ -34,7 +34,7 @@ from curation_ros.nodes.messages import (
 )
 from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import EVENTS, LATCHED, MAPPED
-from curation_ros.nodes.spinning import Finished, run
+from curation_ros.nodes.spinning import Finished, WorkingNode, run
 from sim_node.defects import DEFECTS
 from sim_node.driving import Commands, DrivenEpisode, Driver, DriveSettings
 from sim_node.env import LiberoEnv
@@ -92,7 +92,7 @@ class _Publishers:
         types = {**observation_types, **(COMMAND_TYPES if expert else {})}
         self._publishers = {t: make(message_type(kind), t, MAPPED) for t, kind in types.items()}
         self._publishers[CLOCK_TOPIC] = make(message_type(CLOCK), CLOCK_TOPIC, EVENTS)
-        self._matching = Matching(node)
+        self._discovery = Discovery(node)
 
     def send(self, message: PlainMessage) -> None:
         """Publish a message of an observation or a command."""
@@ -123,7 +123,7 @@ class _Publishers:
     def is_matched(self, node_name: str) -> bool:
         """Whether a node runs and has subscribed, to `episode` too if that is ours."""
         topics = [] if self._episode is None else [self._episode.topic_name]
-        return self._matching.is_complete(node_name, topics)
+        return self._discovery.is_complete(node_name, topics)
 
 
 def several_commanders(node: Node) -> str:
@@ -137,7 +137,7 @@ def several_commanders(node: Node) -> str:
     return " and ".join(sorted(name for _, name in owners)) + f" ({len(infos)} publishers)"
 
 
-class SimNode(Node):
+class SimNode(WorkingNode):
     """Owns the episodes: says where each starts and ends, and what was executed in between."""
 
     def __init__(self) -> None:

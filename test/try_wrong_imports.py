@@ -94,7 +94,7 @@ CHOSEN = (
     Import("curation_ros.bags.reader", "sim_node.starts"),
     Import("curation_ros.batch.audit", "policy_node.policy"),
     Import("curation_ros.live.recorder", "sim_node.env"),
-    Import("curation_ros.cli.score", "curation_ros.nodes.watching"),
+    Import("curation_ros.cli.score", "curation_ros.nodes.watcher"),
     Import("curation_ros.cli.select", "sim_node.starts"),
     Import("curation_ros.study.plan", "sim_node.starts"),
     # Packages that lie in several layers stay empty, and the front door is for others.

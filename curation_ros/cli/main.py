@@ -24,7 +24,7 @@ COMMANDS = {
     "scorers": ("curation_ros.cli.scorers", "list scorers, ours and those of other packages"),
     "self-check": ("curation_ros.cli.self_check", "prove that no score depends on labels"),
     "recover": ("curation_ros.cli.recover", "save what a damaged bag still holds"),
-    "record": ("curation_ros.cli.record", "start and stop a recorder that is driven by hand"),
+    "record": ("curation_ros.cli.record", "start and stop episodes of a running recorder"),
     "collect": ("curation_ros.cli.collect", "record simulated demonstrations, without ROS"),
     "train": ("curation_ros.cli.train", "train a policy on a selection"),
     "evaluate": ("curation_ros.cli.evaluate", "count a policy's successes over start states"),

@@ -1,4 +1,4 @@
-"""`curation record`: the services of a recorder that is driven by hand, for who has no `ros2`."""
+"""`curation record`: calls the services of a recorder, for machines without `ros2`."""
 
 from __future__ import annotations
 
@@ -12,15 +12,19 @@ _PATIENCE_S = 5.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     actions = ("start", "stop", "recover", "keep", "discard")
-    parser.add_argument("action", choices=actions, help="keep and discard: the last episode")
+    parser.add_argument(
+        "action",
+        choices=actions,
+        help="start, stop: an episode; keep, discard: the last episode; recover: partial bags",
+    )
     parser.add_argument("--recorder", default="recorder", help="name of the recorder node")
 
 
 def run(args: argparse.Namespace) -> int:
     """Call the service and print its answer."""
-    from curation_ros.nodes.calling import call_recorder
+    from curation_ros.nodes.recorder_client import call_recorder
 
     success, message = call_recorder(args.recorder, args.action, _PATIENCE_S)
     if not success:

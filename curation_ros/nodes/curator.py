@@ -1,4 +1,4 @@
-"""Curator node: scores an episode when its gate closes, decides, publishes, logs."""
+"""Curator node: scores each episode when its gate closes, decides, publishes and logs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from diagnostic_msgs.srv import SelfTest
-from rclpy.node import Node
 from rclpy.time import Time
 from std_srvs.srv import Trigger
 
@@ -36,25 +35,27 @@ from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import single_from_ros, status_to_ros
 from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import DECISIONS, DRAIN_S, EVENTS, LATCHED
-from curation_ros.nodes.spinning import run, take_waiting
+from curation_ros.nodes.spinning import WorkingNode, run, take_waiting
 from curation_ros.nodes.subscriptions import MappedSubscriptions
 
 PARAMETERS = (
-    Parameter("dataset", "dataset", "dataset whose episodes are decided", needed=True),
+    Parameter("dataset", "dataset", "dataset whose episodes are decided on", is_required=True),
     Parameter("topic_map", "", "YAML file of the topic map; empty: the LIBERO robot of sim_node"),
     Parameter("reference", (), "datasets or bags of trusted demonstrations; empty: none"),
     Parameter("config", "", "YAML file of scorers and rule; empty: config/curation.yaml"),
-    Parameter("scorers", (), "scorers to compute; empty: those of the config"),
-    Parameter("rule", "", "decision rule; empty: that of the config"),
-    Parameter("drain_timeout_s", DRAIN_S, "patience for late samples after an end, s", 0.0, 60.0),
+    Parameter("scorers", (), "scorers to compute; empty: the scorers of the config"),
+    Parameter("rule", "", "decision rule; empty: the rule of the config"),
+    Parameter(
+        "drain_timeout_s", DRAIN_S, "wait this long for late samples after an end, s", 0.0, 60.0
+    ),
 )
-_KEPT = 200
-# A recorder that stops takes what was sent to it first, closes its bag, and says so.
-_LAST_WORD_S = 2.0
+_N_RECENT = 200
+# A recorder that stops takes the pending messages, closes its bag and publishes that.
+_LAST_MESSAGE_S = 2.0
 
 
-class Curator(Node):
-    """Turns messages into samples and events, and decisions into messages; no more."""
+class Curator(WorkingNode):
+    """Turns messages into samples and events, and decisions into messages; nothing else."""
 
     def __init__(self) -> None:
         super().__init__("curator")
@@ -68,12 +69,12 @@ class Curator(Node):
         self._live = LiveCuration(
             dataset, topic_map, CdrDecoder(), curation, drain_timeout_s=p["drain_timeout_s"]
         )
-        known = dataset.latest_decisions(_KEPT).values()
-        self._recent: deque[DiagnosticStatus] = deque(map(_to_ros, known), _KEPT)
-        self._latencies_ms: deque[float] = deque(maxlen=_KEPT)
+        known = dataset.latest_decisions(_N_RECENT).values()
+        self._recent: deque[DiagnosticStatus] = deque(map(_to_ros, known), _N_RECENT)
+        self._latencies_ms: deque[float] = deque(maxlen=_N_RECENT)
         self._decided = self.create_publisher(DiagnosticArray, "curator/decision", DECISIONS)
         self._alerted = self.create_publisher(DiagnosticArray, "curator/alert", EVENTS)
-        # Before the data subscriptions: see the recorder.
+        # Before the data subscriptions, for the reason that the recorder gives.
         self.create_subscription(DiagnosticArray, "episode", self._on_episode, LATCHED)
         self.create_subscription(DiagnosticArray, "recorder/status", self._on_recorder, LATCHED)
         self.create_subscription(KeyValue, "curator/override", self._on_override, EVENTS)
@@ -90,13 +91,13 @@ class Curator(Node):
     def _on_episode(self, message: DiagnosticArray) -> None:
         try:
             event = event_from_status(single_from_ros(message))
-            self._tell(self._live.event(event, time.monotonic()))
+            self._publish_news(self._live.event(event, time.monotonic()))
         except CurationError as err:
             self.get_logger().error(f"topic episode: {err}")
 
     def _on_sample(self, sample: Sample) -> None:
         try:
-            self._tell(self._live.sample(sample, time.monotonic()))
+            self._publish_news(self._live.sample(sample, time.monotonic()))
         except CurationError as err:
             self.get_logger().error(str(err))
 
@@ -104,7 +105,7 @@ class Curator(Node):
         status = message.status[0] if message.status else None
         if status is not None and status.message.startswith("closed "):
             try:
-                self._tell(self._live.bag_closed(status.hardware_id))
+                self._publish_news(self._live.bag_closed(status.hardware_id))
             except CurationError as err:
                 self.get_logger().error(str(err))
 
@@ -143,21 +144,21 @@ class Curator(Node):
     # --- messages out -----------------------------------------------------------------------
 
     def work(self) -> bool:
-        """Close gates whose time is over, and report."""
+        """Close gates whose time is over, and report health."""
         now_s = time.monotonic()
         try:
-            self._tell(self._live.tick(now_s))
+            self._publish_news(self._live.tick(now_s))
         except CurationError as err:
             self.get_logger().error(str(err))
         running = self._live.running
-        # At once when an episode begins, too: replay waits for that.
+        # Also at once when an episode begins, because replay waits for that.
         if self._health.due(now_s) or running != self._running:
             self._running = running
             problems = self._mapped.check(running=bool(running))
             if self.count_publishers("episode") > 1:
                 problems.insert(0, "topic episode has two owners: stop one of them")
             values = {"decisions": str(len(self._latencies_ms))}
-            values |= counts_to_values(self._live.counts()) | self._mapped.seen()
+            values |= counts_to_values(self._live.counts()) | self._mapped.publishers_found()
             if self._latencies_ms:
                 middle, worst = np.percentile(list(self._latencies_ms), [50, 99])
                 values |= {"latency_ms_p50": f"{middle:.1f}", "latency_ms_p99": f"{worst:.1f}"}
@@ -165,14 +166,14 @@ class Curator(Node):
         return False
 
     def close(self) -> None:
-        """Wait a moment for the end of the episode that runs: its owner may be stopping, too."""
-        deadline_s = time.monotonic() + _LAST_WORD_S
+        """Wait a moment for the end of the running episode: its owner may be stopping, too."""
+        deadline_s = time.monotonic() + _LAST_MESSAGE_S
         while self._live.running and time.monotonic() < deadline_s:
             if not take_waiting(self):
-                time.sleep(_LAST_WORD_S / 100)
+                time.sleep(_LAST_MESSAGE_S / 100)
             self.work()
 
-    def _tell(self, decided: list[Decided]) -> None:
+    def _publish_news(self, decided: list[Decided]) -> None:
         for alert in self._live.take_alerts():
             status = status_to_ros(alert_to_status(alert.episode, alert.name, alert.finding))
             message = DiagnosticArray(status=[status])

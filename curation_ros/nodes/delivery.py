@@ -1,4 +1,4 @@
-"""Last words: a node that goes takes with it what the transport would have sent again."""
+"""Waits for the delivery of last messages, which the transport cannot send again afterwards."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from rclpy.duration import Duration
 
 from curation_ros.core.types import NS_PER_S
 
-# Fast DDS asks for acknowledgements every 3 s; who was killed never answers.
+# Fast DDS asks for acknowledgements every 3 s. A subscriber that was killed never answers.
 _PATIENCE_S = 4.0
 
 
 def deliver(publishers: Iterable[Any]) -> None:
-    """Wait until all subscribers have all that was published, for a few seconds in all."""
+    """Wait until all subscribers have all messages, for at most 4 s in total."""
     deadline_s = time.monotonic() + _PATIENCE_S
     for publisher in publishers:
         left_ns = int((deadline_s - time.monotonic()) * NS_PER_S)

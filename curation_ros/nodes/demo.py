@@ -43,7 +43,7 @@ from curation_ros.nodes.processes import Domain, Nodes
 
 if TYPE_CHECKING:
     from curation_ros.core.episode.status import EpisodeEvent, Status
-    from curation_ros.nodes.watching import Watcher
+    from curation_ros.nodes.watcher import Watcher
 
 #: Standard deviation of the noise on the start positions in training. It was chosen on generated
 #: starts. Without it, a dozen demonstrations give a poor policy in any case.
@@ -85,7 +85,7 @@ def run_demo(folder: Path, settings: DemoSettings) -> Generator[DemoEvent, None,
 
 
 def _record(dataset: Path, n: int, logs: Path) -> Iterator[DemoEvent]:
-    from curation_ros.nodes.watching import Watcher
+    from curation_ros.nodes.watcher import Watcher
 
     yield Recording("", 0)
     domain = Domain()

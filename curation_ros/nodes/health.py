@@ -1,4 +1,4 @@
-"""Health of a node on /diagnostics, once a second."""
+"""Health of a node on /diagnostics, once per second."""
 
 from __future__ import annotations
 
@@ -15,15 +15,23 @@ _PERIOD_S = 1.0
 
 
 def publishers_found(counts: Mapping[str, int]) -> dict[str, str]:
-    """Values for a report: how many publishers of each topic, by full name, a node has found."""
+    """The number of publishers per topic, as values of a report.
+
+    Args:
+        counts: full name of a topic -> number of publishers that the node has found.
+    """
     return {f"publishers/{topic.lstrip('/')}": str(n) for topic, n in counts.items()}
 
 
 class Health:
-    """Publishes one status a node: OK, or ERROR with the first problem as its message."""
+    """Publishes the status of a node: OK, or ERROR with the first problem as its message."""
 
     def __init__(self, node: Node) -> None:
-        """Announce a node."""
+        """Create the publisher.
+
+        Args:
+            node: the node whose health it is.
+        """
         self._node = node
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", EVENTS)
         self._last_s = 0.0
@@ -39,13 +47,13 @@ class Health:
         values: Mapping[str, str],
         episode_id: str = "",
     ) -> None:
-        """Report.
+        """Publish a report.
 
         Args:
-            now_s: time of `due`.
-            problems: what is wrong now, the worst first.
+            now_s: the time that `due` was asked about, in s.
+            problems: what is wrong now, the worst problem first.
             values: figures of the node.
-            episode_id: the episode that the figures are about, if one is running.
+            episode_id: the running episode, which the figures are about; may be empty.
         """
         self._last_s = now_s
         level, message = (ERROR, problems[0]) if problems else (OK, "ok")

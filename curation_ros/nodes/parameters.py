@@ -1,4 +1,4 @@
-"""Parameters of a node as one table: declared, checked and documented from the same lines."""
+"""Parameters of a node as one table, which declares, checks and documents them."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ from curation_ros.core.errors import ConfigError
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter; all are read once, at start.
+    """One parameter. All parameters are read once, when the node starts.
 
     Attributes:
         name: its name.
-        default: default value; its type is the parameter's type, `()` is an empty list of strings.
+        default: default value. Its type is the type of the parameter; `()` is an empty list of
+            strings.
         description: meaning and unit, in one line.
         low, high: range of a number, inclusive.
-        choices: allowed texts.
-        needed: whether an empty text is refused.
+        choices: allowed texts; empty: any.
+        is_required: whether an empty text is refused.
     """
 
     name: str
@@ -39,14 +40,17 @@ class Parameter:
     low: float | None = None
     high: float | None = None
     choices: Sequence[str] = ()
-    needed: bool = False
+    is_required: bool = False
 
 
 def declare(node: Node, table: Sequence[Parameter]) -> dict[str, Any]:
-    """Declare the parameters of a node and return their values.
+    """Declare the parameters of a node and read their values.
+
+    Returns:
+        Name -> value.
 
     Raises:
-        ConfigError: naming node, parameter, what was found and what was expected.
+        ConfigError: if a value has the wrong type, is out of range, or is not allowed.
     """
     values = {}
     for p in table:
@@ -60,7 +64,7 @@ def declare(node: Node, table: Sequence[Parameter]) -> dict[str, Any]:
                 descriptor.integer_range = [span]
         if p.choices:
             descriptor.additional_constraints = "one of: " + ", ".join(p.choices)
-        # An empty list has no type of its own, so it is declared by type, without a default.
+        # An empty list has no type, so it is declared by type, without a default.
         default = RosParameter.Type.STRING_ARRAY if p.default == () else p.default
         where = f"{node.get_name()}: parameter {p.name!r}"
         try:
@@ -81,17 +85,17 @@ def declare(node: Node, table: Sequence[Parameter]) -> dict[str, Any]:
         value = p.default if value is None else value
         if p.choices and value not in p.choices:
             raise ConfigError(f"{where}: {value!r} is none of {', '.join(p.choices)}")
-        if p.needed and not value:
-            raise ConfigError(f"{where} is empty: it is the {p.description}")
-        # What `[$(var reference)]` makes of nothing in a launch file is a list of one empty text.
+        if p.is_required and not value:
+            raise ConfigError(f"{where} is empty: expected the {p.description}")
+        # In a launch file, `[$(var reference)]` of an empty reference is a list of one empty text.
         values[p.name] = [text for text in value if text] if p.default == () else value
     return values
 
 
 def warn_of_unknown(node: Node, table: Sequence[Parameter]) -> None:
-    """Log the parameters that were given and do not exist.
+    """Log each given parameter that the node does not have.
 
-    A file may give parameters to many nodes at once (`/**`), so that they are no error.
+    It is no error: a file may give parameters to many nodes at once (`/**`).
     """
     for name in sorted(set(node._parameter_overrides) - set(node._parameters)):
         near = get_close_matches(name, [p.name for p in table], 1)
@@ -100,7 +104,7 @@ def warn_of_unknown(node: Node, table: Sequence[Parameter]) -> None:
 
 
 def described(table: Sequence[Parameter]) -> str:
-    """The parameters of a node, a line each, for who asks on the command line."""
+    """The text of --help: one line per parameter."""
     defaults = ["[]" if p.default == () else json.dumps(p.default) for p in table]
     names, width = max(len(p.name) for p in table), max(map(len, defaults))
     lines = [

@@ -1,4 +1,4 @@
-"""Starts our nodes as processes on a domain of their own, and leaves none behind."""
+"""Node processes on a ROS domain of their own. None is left behind."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from curation_ros.core.errors import CurationError
 from curation_ros.files import try_lock
 from curation_ros.nodes.programs import NODE_MODULES
 
-# Domains above 101 need ports of the ephemeral range of Linux.
+# Domains above 101 need ports from Linux's ephemeral range.
 _DOMAINS = range(1, 102)
 _PATIENCE_S = 10.0
 _PR_SET_PDEATHSIG = 1
-# Looked up once: between fork and exec a child of several threads must do next to nothing.
+# Looked up once: a child of a process with threads must do next to nothing between fork and exec.
 _PRCTL = getattr(ctypes.CDLL(None), "prctl", None)
 
 
 class Domain:
-    """A ROS domain id that no other process of ours uses; free again when closed."""
+    """A ROS domain id that no other process of this package uses, until it is closed."""
 
     def __init__(self) -> None:
-        """Find a free one.
+        """Take a free domain id.
 
         Raises:
             CurationError: if all are taken.
@@ -78,26 +78,26 @@ def _is_in_use(domain_id: int) -> bool:
 
 
 def _die_with_parent() -> None:
-    # Linux only; elsewhere children outlive a parent that was killed.
-    # Who was started in the background by a shell ignores SIGINT, and so would its children.
+    # A process that a shell has started in the background ignores SIGINT. Children inherit that.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # Linux only. Elsewhere, children outlive a parent that was killed.
     if _PRCTL is not None:
         _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 class Nodes:
-    """Node processes that are stopped, in reverse order, when the block ends.
+    """Node processes, which are stopped in reverse order when the `with` block ends.
 
-    They run in sessions of their own, so that Ctrl-C in a terminal reaches only us, and we decide
-    in which order they end.
+    They run in sessions of their own. Ctrl-C in a terminal reaches only this process, which then
+    stops them in order.
     """
 
     def __init__(self, domain: Domain, log_folder: Path) -> None:
-        """Make an empty set.
+        """Start without processes.
 
         Args:
-            domain: where they run.
-            log_folder: each node's output goes to `<name>.log` in it.
+            domain: where they will run.
+            log_folder: gets the output of each process, in `<key>.log`.
         """
         self._domain = domain
         self._logs = log_folder
@@ -129,8 +129,8 @@ class Nodes:
         Args:
             node: one of NODE_MODULES.
             parameters: values of its parameters.
-            key: name of the process and its log, where a node runs twice.
-            remaps: ROS names and what they become; `__ns` is the namespace.
+            key: name of the process and its log; empty: the name of the node.
+            remaps: ROS name -> new name; `__ns` is the namespace.
         """
         key = key or node
         arguments = [sys.executable, "-m", NODE_MODULES[node]]
@@ -156,11 +156,11 @@ class Nodes:
         return self._running[key][0].pid
 
     def ended(self, key: str) -> int | None:
-        """Exit code of a process, None while it runs."""
+        """Exit code of a process; None while it runs."""
         return self._running[key][0].poll()
 
     def check(self) -> None:
-        """Complain if a process has failed.
+        """Raise an error if a process has failed.
 
         Raises:
             CurationError: with the last line of its log.
@@ -169,7 +169,7 @@ class Nodes:
             if process.poll() not in (None, 0):
                 path = self._logs / f"{key}.log"
                 lines = path.read_text(errors="replace").strip().splitlines()
-                last = lines[-1] if lines else "it said nothing"
+                last = lines[-1] if lines else "its log is empty"
                 raise CurationError(f"{key} ended with code {process.returncode}: {last} ({path})")
 
     def wait(self, key: str, timeout_s: float) -> None:
@@ -187,7 +187,7 @@ class Nodes:
         self.check()
 
     def stop(self, key: str) -> None:
-        """End a process: asked first, made to in the end."""
+        """Stop a process by SIGINT, then SIGTERM, then SIGKILL, if it needs them."""
         process, log = self._running.pop(key)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
             if process.poll() is not None:
@@ -201,7 +201,7 @@ class Nodes:
 def node_arguments(
     parameters: Mapping[str, Any], remaps: Mapping[str, str] = MappingProxyType({})
 ) -> list[str]:
-    """Parameters and remaps of a node, as its command line has them."""
+    """Command line arguments for parameters and remaps of a node."""
     arguments = ["--ros-args"]
     for name, value in parameters.items():
         arguments += ["-p", f"{name}:={_yaml(value)}"]
@@ -211,7 +211,7 @@ def node_arguments(
 
 
 def _yaml(value: Any) -> str:
-    """A parameter value as ROS arguments spell it."""
+    """A parameter value, as ROS arguments spell it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, Sequence) and not isinstance(value, str):

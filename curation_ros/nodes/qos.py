@@ -1,4 +1,4 @@
-"""The QoS profiles of the graph: one place, both sides."""
+"""The QoS profiles of the graph, for publishers and subscribers alike."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:
 
 #: Mapped and command topics, see `curation_ros.bags.qos.MAPPED`.
 MAPPED = _profile(qos.MAPPED.depth, DurabilityPolicy.VOLATILE)
-#: `episode` and `recorder/status`: who comes late still sees the last ones.
+#: `episode` and `recorder/status`: late subscribers still receive the last messages.
 LATCHED = _profile(10, DurabilityPolicy.TRANSIENT_LOCAL)
 #: `curator/decision`: the last 200.
 DECISIONS = _profile(200, DurabilityPolicy.TRANSIENT_LOCAL)
 #: Alerts, overrides, diagnostics.
 EVENTS = _profile(50, DurabilityPolicy.VOLATILE)
-#: Patience for samples that are late. What the transport has dropped comes again when Fast DDS
-#: next asks for acknowledgements, every 3 s.
+#: How long to wait for late samples, in s. Fast DDS sends a lost message again when it next asks
+#: for acknowledgements, which it does every 3 s.
 DRAIN_S = 5.0

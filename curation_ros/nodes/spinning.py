@@ -1,4 +1,4 @@
-"""How every node of ours starts, spins and stops."""
+"""Runs a node as a process: parameters, callbacks, work between them, signals and the end."""
 
 from __future__ import annotations
 
@@ -6,116 +6,148 @@ import os
 import signal
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from types import FrameType
-from typing import Protocol
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
+from rclpy.utilities import remove_ros_args, try_shutdown
 
-from curation_ros.core.errors import CurationError
+from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.nodes.parameters import Parameter, described, warn_of_unknown
 
 _IDLE_S = 0.02
-#: A node that stops has taken everything after so long a silence; a publisher may never be silent.
+#: A node that stops has received everything after this long a silence. A publisher may never be
+#: silent, so the wait as a whole is limited, too.
 _QUIET_S, _DRAIN_S = 0.05, 1.0
-#: Who is asked for something catches up for so long; a publisher may be faster than we are.
+#: Before answering a service call, take pending messages for at most this long. A publisher may
+#: be faster than the node.
 _CATCH_UP_S = 0.2
 
 
-class Worker(Protocol):
-    """What a node adds to rclpy's Node."""
+class WorkingNode(Node, ABC):
+    """A node that also works between callbacks."""
 
+    @abstractmethod
     def work(self) -> bool:
-        """Do a little work between callbacks; True asks to be called again at once."""
-        ...
+        """Do a little work; True asks to be called again at once."""
 
+    @abstractmethod
     def close(self) -> None:
-        """Finish files and say goodbye; the ROS context is still valid."""
-        ...
+        """Finish files and publish the last messages. The ROS context is still valid."""
 
 
 class Finished(Exception):  # noqa: N818  it is no error
-    """Raised by `work` when a node has done all it was started for."""
+    """Raised by `work` when a node has done everything it was started for."""
 
 
-def run(make: Callable[[], Node], table: Sequence[Parameter], args: Sequence[str] = ()) -> int:
+class _Signals:
+    """Counts the signals that ask the process to stop.
+
+    rclpy's own handlers are not installed. They shut the context down before the node could close
+    its bag and publish that it did, and they leave SIGHUP to kill the process.
+    """
+
+    def __init__(self) -> None:
+        self.n_received = 0
+        self.is_starting = True
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._receive)
+
+    def _receive(self, _number: int, _frame: FrameType | None) -> None:
+        self.n_received += 1
+        # Loading LIBERO takes longer than a sender of signals waits.
+        if self.is_starting and self.n_received == 1:
+            raise Finished
+
+
+def run(
+    make: Callable[[], WorkingNode], table: Sequence[Parameter], args: Sequence[str] = ()
+) -> int:
     """Run one node until SIGINT, SIGTERM or SIGHUP, or until it is finished.
-
-    rclpy's own signal handlers are not installed: they shut the context down before the node
-    could close its bag and publish that it did, and they leave SIGHUP to kill the process.
 
     Args:
         make: makes the node.
         table: its parameters, for --help.
-        args: of the command line, the program's name first; none: those of this process.
+        args: command line with the program's name; empty: the command line of this process.
 
     Returns:
         Exit code: 0 done, 2 wrong parameters or input.
     """
-    stopping: list[int] = []
-    node: Node | None = None
-
-    def stop(number: int, _frame: FrameType | None) -> None:
-        stopping.append(number)
-        if node is None and len(stopping) == 1:  # to load LIBERO takes longer than patience lasts
-            raise Finished
-
+    node: WorkingNode | None = None
     try:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, stop)
-        words = list(args or sys.argv)
-        try:
-            own = remove_ros_args(words)[1:]
-            rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
-        except RuntimeError as err:  # rclpy raises its own classes of it
-            return _complain(f"ROS arguments: {str(err).partition(', at /')[0]}")
-        if {"-h", "--help"}.intersection(own):
-            try:
-                print(described(table), flush=True)  # noqa: T201
-            except BrokenPipeError:  # the reader of our output has gone, as `head` does
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
-        if own:
+        signals = _Signals()
+        rest = _initialise(list(args or sys.argv))
+        if {"-h", "--help"}.intersection(rest):
+            return _help(table)
+        if rest:
             return _complain(
-                f"unknown argument {own[0]!r}: parameters follow --ros-args -p; --help lists them"
+                f"unknown argument {rest[0]!r}: parameters follow --ros-args -p; --help lists them"
             )
         node = make()
+        signals.is_starting = False
         warn_of_unknown(node, table)
-        node.get_logger().info(
-            f"domain {os.environ.get('ROS_DOMAIN_ID', '0')}, discovery range "
-            f"{os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET (default)')}"
-        )
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        while not stopping:
-            busy = node.work()  # type: ignore[attr-defined]
-            executor.spin_once(timeout_sec=0.0 if busy else _IDLE_S)
-            take_waiting(node)
-        executor.remove_node(node)
+        _spin(node, signals)
     except Finished:
         pass
     except CurationError as err:
         return _complain(err)
     finally:
         if node is not None:
-            node.close()  # type: ignore[attr-defined]
+            node.close()
             node.destroy_node()
-        rclpy.try_shutdown()  # type: ignore[attr-defined]
-        # launch passes on a Ctrl-C that we have had; while Python ends, it would kill.
+        try_shutdown()
+        # launch passes on a Ctrl-C that this process has received already. It must not end
+        # Python in its last moments.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     return 0
 
 
-def take_waiting(node: Node) -> bool:
-    """Serve what has come meanwhile, at most one message a subscription; whether there was any.
+def _initialise(words: list[str]) -> list[str]:
+    """Start rclpy and return the arguments that are not ROS's.
 
-    The executor builds a new wait set for every message or two, which takes some 0.3 ms; to take
-    a message, or to find that there is none, takes microseconds. The order is the executor's own:
-    that in which subscriptions were created. Raw ones are those whose callbacks take message info.
+    Raises:
+        ConfigError: if ROS cannot read its arguments.
+    """
+    try:
+        rest: list[str] = remove_ros_args(words)[1:]
+        rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as err:  # rclpy raises classes of its own that derive from it
+        raise ConfigError(f"ROS arguments: {str(err).partition(', at /')[0]}") from err
+    return rest
+
+
+def _help(table: Sequence[Parameter]) -> int:
+    try:
+        print(described(table), flush=True)  # noqa: T201
+    except BrokenPipeError:  # the reader of the output is gone, as with `head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+def _spin(node: WorkingNode, signals: _Signals) -> None:
+    node.get_logger().info(
+        f"domain {os.environ.get('ROS_DOMAIN_ID', '0')}, discovery range "
+        f"{os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET (default)')}"
+    )
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while not signals.n_received:
+        is_busy = node.work()
+        executor.spin_once(timeout_sec=0.0 if is_busy else _IDLE_S)
+        take_waiting(node)
+    executor.remove_node(node)
+
+
+def take_waiting(node: Node) -> bool:
+    """Take at most one waiting message per subscription; True if there was any.
+
+    The executor builds a new wait set for every message or two, which takes 0.3 ms. Taking a
+    message, or finding none, takes microseconds. The order is the executor's own: the order in
+    which the subscriptions were created. Raw subscriptions get the message info as well.
     """
     any_taken = False
     for subscription in list(node.subscriptions):
@@ -129,14 +161,14 @@ def take_waiting(node: Node) -> bool:
 
 
 def take_arrived(node: Node) -> None:
-    """Serve all that has arrived: a request may overtake what was sent before it."""
+    """Take all messages that have arrived. A service call may overtake earlier messages."""
     deadline_s = time.monotonic() + _CATCH_UP_S
     while take_waiting(node) and time.monotonic() < deadline_s:
         pass
 
 
 def take_all(node: Node) -> None:
-    """Serve all that was sent to a node that stops, for a second at most: it may be behind."""
+    """Take all messages that were sent to a node that stops, for a second at most."""
     now_s = time.monotonic()
     deadline_s, quiet_from_s = now_s + _DRAIN_S, now_s
     while now_s < min(deadline_s, quiet_from_s + _QUIET_S):

@@ -1,4 +1,4 @@
-"""Raw subscriptions to the mapped topics, and what the graph says about their publishers."""
+"""Raw subscriptions to the mapped topics, and the state of their publishers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from curation_ros.nodes.qos import MAPPED
 
 
 class MappedSubscriptions:
-    """One persistent raw subscription a mapped topic, alive between episodes too."""
+    """One raw subscription per mapped topic. They stay alive between episodes."""
 
     def __init__(
         self, node: Node, topic_map: TopicMap, on_sample: Callable[[Sample], None]
@@ -27,7 +27,7 @@ class MappedSubscriptions:
 
         Args:
             node: the subscribing node.
-            topic_map: which topics.
+            topic_map: the topics and their types.
             on_sample: called with every sample, in the node's executor.
 
         Raises:
@@ -39,7 +39,7 @@ class MappedSubscriptions:
         self._types = {t: message_type(name, t) for t, name in topic_map.topics.items()}
         self._subscriptions = {t: self._subscribe(t, MAPPED) for t in topic_map.topics}
         self._reported: set[str] = set()
-        self._seen: dict[str, int] = {}
+        self._n_publishers: dict[str, int] = {}
 
     def _subscribe(self, topic: str, qos: QoSProfile) -> Any:
         by_source = topic in self._map.source_stamped
@@ -62,7 +62,7 @@ class MappedSubscriptions:
                 )
             )
 
-        # rclpy's hints know no callback with message info.
+        # The type hints of rclpy lack callbacks with message info.
         callback: Any = receive
         return self._node.create_subscription(self._types[topic], topic, callback, qos, raw=True)
 
@@ -78,26 +78,26 @@ class MappedSubscriptions:
             depth=profile.depth, reliability="reliable" if reliable else "best_effort"
         )
 
-    def publishers(self, topic: str) -> int:
+    def n_publishers(self, topic: str) -> int:
         """Number of publishers of a topic that the graph shows now, at least 1."""
         return max(1, len(self._node.get_publishers_info_by_topic(self.resolved(topic))))
 
     def check(self, *, running: bool) -> list[str]:
-        """Compare the graph with the map; to be called every second, between episodes too.
+        """Compare the graph with the map. Call it every second, between episodes too.
 
-        A topic of another type is named once in the log; where a publisher offers only best
-        effort, the subscription is made anew so that it matches.
+        A topic of another type is logged once. If a publisher offers only best effort, the
+        subscription is made again with that.
 
         Args:
-            running: whether an episode runs: only then is a missing publisher a problem.
+            running: whether an episode runs. Otherwise a missing publisher is no problem.
 
         Returns:
-            What is wrong now, one line a topic.
+            What is wrong now, one line per problem.
         """
         problems = []
         for topic, expected in self._map.topics.items():
             infos = self._node.get_publishers_info_by_topic(self.resolved(topic))
-            self._seen[self.resolved(topic)] = len(infos)
+            self._n_publishers[self.resolved(topic)] = len(infos)
             if running and not infos:
                 problems.append(f"topic {self.resolved(topic)}: no publisher")
             for info in infos:
@@ -124,10 +124,11 @@ class MappedSubscriptions:
                 self._subscriptions[topic] = self._subscribe(topic, best_effort)
         return problems
 
-    def seen(self) -> dict[str, str]:
-        """For /diagnostics: publishers of `episode` and of each mapped topic, as last checked."""
+    def publishers_found(self) -> dict[str, str]:
+        """Publishers of `episode`, and of each topic at the last check, for /diagnostics."""
         episode = self._node.resolve_topic_name("episode")
-        return publishers_found({episode: self._node.count_publishers(episode), **self._seen})
+        n_owners = self._node.count_publishers(episode)
+        return publishers_found({episode: n_owners, **self._n_publishers})
 
     def _report(self, problem: str) -> None:
         if problem not in self._reported:

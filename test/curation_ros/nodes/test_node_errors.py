@@ -77,7 +77,7 @@ CASES = {
     "nobody_to_replay_to": (
         "replay",
         {"bags": ["{}/a.mcap"], "wait_s": 0.5},
-        "no curator listens",
+        "no curator subscribes to episode",
     ),
     "no_policy": ("policy_node", {}, "parameter 'policy' is empty"),
     "policy_missing": ("policy_node", {"policy": "{}/nowhere"}, "nowhere"),

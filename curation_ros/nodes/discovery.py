@@ -1,4 +1,4 @@
-"""Whether another node is there and hears us."""
+"""Discovery of other nodes: whether a node is there with all its subscriptions."""
 
 from __future__ import annotations
 
@@ -10,18 +10,22 @@ from rclpy.node import Node
 _SETTLED_S = 0.5
 
 
-class Matching:
-    """What the graph shows of other nodes' subscriptions, and since when."""
+class Discovery:
+    """Remembers which subscriptions of other nodes the graph has shown, and since when."""
 
     def __init__(self, node: Node) -> None:
-        """Watch with the eyes of a node."""
+        """Start with nothing known.
+
+        Args:
+            node: the node whose view of the graph is used.
+        """
         self._node = node
-        self._seen: dict[str, tuple[float, frozenset[str]]] = {}
+        self._found: dict[str, tuple[float, frozenset[str]]] = {}
 
     def is_complete(self, node_name: str, topics: Iterable[str] = ()) -> bool:
-        """Whether a node is there, with all its subscriptions.
+        """Whether a node is there with all its subscriptions.
 
-        Endpoints are discovered one by one, on either side: they count as complete when the graph
+        Endpoints are discovered one by one, on either side. They count as complete when the graph
         has shown the same ones for half a second.
 
         Args:
@@ -34,12 +38,12 @@ class Matching:
             return False
         try:
             known = self._node.get_subscriber_names_and_types_by_node(node_name, spaces[0])
-        except RuntimeError:  # gone again (rclpy raises its own class of it)
+        except RuntimeError:  # the node is gone again (rclpy raises a class derived from it)
             return False
         names = frozenset(name for name, _ in known)
         now_s = time.monotonic()
-        since_s, before = self._seen.get(node_name, (now_s, frozenset()))
+        since_s, before = self._found.get(node_name, (now_s, frozenset()))
         if names != before:
-            self._seen[node_name] = (now_s, names)
+            self._found[node_name] = (now_s, names)
             return False
         return names.issuperset(topics) and now_s - since_s > _SETTLED_S

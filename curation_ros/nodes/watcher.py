@@ -1,4 +1,4 @@
-"""Watches episodes, alerts and decisions on the graph, for whoever shows them."""
+"""Collects episodes, alerts and decisions from the graph, for programs that show them."""
 
 from __future__ import annotations
 
@@ -20,19 +20,21 @@ from curation_ros.nodes.qos import DECISIONS, EVENTS, LATCHED
 
 
 class Watcher:
-    """Collects what was said since the last look; use it in a `with` block.
+    """Collects messages; use it in a `with` block.
+
+    Whoever shows a message takes it from its queue.
 
     Attributes:
-        events: of topic `episode`, oldest first.
-        alerts: of topic `curator/alert`, oldest first.
-        decisions: of topic `curator/decision`, oldest first.
+        events: messages of topic `episode`, oldest first.
+        alerts: messages of topic `curator/alert`, oldest first.
+        decisions: messages of topic `curator/decision`, oldest first.
     """
 
     def __init__(self, environment: Mapping[str, str]) -> None:
-        """Join the graph.
+        """Set the environment of this process.
 
         Args:
-            environment: ROS variables of the domain to watch; set for this process.
+            environment: ROS variables of the domain to watch.
         """
         os.environ.update(environment)
         self.events: deque[EpisodeEvent] = deque()
@@ -41,7 +43,7 @@ class Watcher:
         self._context = rclpy.context.Context()
 
     def __enter__(self) -> Watcher:
-        # Without signal handlers: Ctrl-C belongs to the program that watches.
+        # rclpy installs no signal handlers for such a context: Ctrl-C belongs to the program.
         rclpy.init(context=self._context)
         self._node = rclpy.create_node("watcher", context=self._context)
         self._node.create_subscription(DiagnosticArray, "episode", self._on_episode, LATCHED)
@@ -63,11 +65,15 @@ class Watcher:
         self._context.try_shutdown()
 
     def look(self, seconds: float) -> None:
-        """Listen for a while."""
+        """Receive at most one message.
+
+        Args:
+            seconds: how long to wait for it.
+        """
         self._executor.spin_once(timeout_sec=seconds)
 
     def _on_episode(self, message: DiagnosticArray) -> None:
-        with suppress(CurationError):  # the nodes complain of it
+        with suppress(CurationError):  # the nodes log it
             self.events.append(event_from_status(single_from_ros(message)))
 
     def _on_alert(self, message: DiagnosticArray) -> None:

@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import rclpy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import try_shutdown
 from std_srvs.srv import SetBool, Trigger
 
 from curation_ros.core.errors import CurationError
 
 
 def call_recorder(recorder: str, action: str, timeout_s: float) -> tuple[bool, str]:
-    """Call `~/start`, `~/stop`, `~/recover`, or `~/finalize` (keep and discard).
+    """Call a service of a recorder.
+
+    Args:
+        recorder: name of the node.
+        action: `start`, `stop` or `recover` calls the service of that name; `keep` or `discard`
+            calls `finalize`.
+        timeout_s: for each of two waits, for the service and for its answer, in s.
 
     Returns:
-        Whether it succeeded, and what it said.
+        Whether the call succeeded, and the message of the answer.
 
     Raises:
         CurationError: if no recorder answers in time.
     """
-    # With its handlers rclpy would leave the caller deaf to SIGTERM for good, also after shutdown.
+    # rclpy's signal handlers would leave the caller without SIGTERM for good, even after shutdown.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = rclpy.create_node("curation_record")
@@ -37,4 +44,4 @@ def call_recorder(recorder: str, action: str, timeout_s: float) -> tuple[bool, s
         response = future.result()
         return bool(response.success), str(response.message)
     finally:
-        rclpy.try_shutdown()  # type: ignore[attr-defined]
+        try_shutdown()

@@ -1,4 +1,4 @@
-"""Episodes of a recorder that a person drives: it is their owner, and says so on `episode`."""
+"""Episodes that a person starts and stops. The recorder owns them and publishes `episode`."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from curation_ros.nodes.delivery import deliver
 from curation_ros.nodes.messages import array_to_ros
 from curation_ros.nodes.qos import LATCHED
 
-#: Whether a request was granted, and what to answer.
+#: Whether a request was granted, and the message of the answer.
 Answer = tuple[bool, str]
 
 
-class ByHand:
-    """Starts and ends episodes at the stamps of the clock topic, never at the recorder's time.
+class ManualEpisodes:
+    """Starts and ends episodes at stamps of the clock topic, never at the recorder's own time.
 
     Attributes:
-        clock_ns: last stamp of the clock topic; kept by the recorder.
+        clock_ns: last stamp of the clock topic, in ns; the recorder keeps it up to date.
     """
 
     def __init__(
         self,
         node: Node,
         recording: Recording,
-        tell: Callable[[Sequence[Notice]], None],
+        publish_notices: Callable[[Sequence[Notice]], None],
         *,
-        task: str,
+        name_prefix: str,
         clock_topic: str,
     ) -> None:
         """Become the owner of `episode`.
@@ -42,17 +42,18 @@ class ByHand:
         Args:
             node: the recorder.
             recording: writes the bags.
-            tell: publishes what became of them.
-            task: short names are <task>-<number>, going on where the dataset stands.
-            clock_topic: resolved name, for messages.
+            publish_notices: publishes what happened to the bags.
+            name_prefix: short names are <name_prefix>-<number>. Numbers continue those of the
+                dataset.
+            clock_topic: resolved name of the clock topic, for messages.
         """
         self._node = node
         self._recording = recording
-        self._tell = tell
-        self._task = task
+        self._publish_notices = publish_notices
+        self._name_prefix = name_prefix
         self._clock_topic = clock_topic
         named = [name.rpartition("-") for _, name in recording.dataset.names()]
-        numbers = [int(n) for name, _, n in named if name == task and n.isdigit()]
+        numbers = [int(n) for prefix, _, n in named if prefix == name_prefix and n.isdigit()]
         self._number = max(numbers, default=0)
         self._running: EpisodeEvent | None = None
         self._episode = node.create_publisher(DiagnosticArray, "episode", LATCHED)
@@ -64,12 +65,12 @@ class ByHand:
             return False, f"episode {self._running.name} is running: stop it first"
         if not self.clock_ns:
             return False, (
-                f"nothing has arrived on {self._clock_topic}, whose stamps are the episode's clock"
+                f"no message on {self._clock_topic} yet; its stamps are the episode's clock"
             )
-        name = f"{self._task}-{self._number + 1:04d}"
+        name = f"{self._name_prefix}-{self._number + 1:04d}"
         event = EpisodeEvent(new_episode_id(), name, "started", self.clock_ns + 1)
         notices = self._recording.event(event, time.monotonic())
-        self._tell(notices)
+        self._publish_notices(notices)
         if event.id not in self._recording.open_ids:
             return False, "; ".join(n.reason for n in notices)
         self._number += 1
@@ -86,7 +87,11 @@ class ByHand:
         return True, json.dumps({"episode": started.id, "name": started.name})
 
     def give_up(self, reason: str) -> None:
-        """Abort the running episode, if there is one, and see that everybody hears of it."""
+        """Abort the running episode, if there is one, and wait until all subscribers know.
+
+        Args:
+            reason: why, for people.
+        """
         if self._running is not None:
             self._end(replace(self._running, event="aborted", reason=f"aborted: {reason}"))
             deliver([self._episode])
@@ -95,7 +100,7 @@ class ByHand:
         self._running = None
         event = replace(event, end_ns=max(self.clock_ns, event.start_ns))
         self._publish(event)
-        self._tell(self._recording.event(event, time.monotonic()))
+        self._publish_notices(self._recording.event(event, time.monotonic()))
 
     def _publish(self, event: EpisodeEvent) -> None:
         stamp_ns = self._node.get_clock().now().nanoseconds
