@@ -79,7 +79,7 @@ class Ensemble(Scorer):
     def fit(self, episodes: Sequence[Episode]) -> Self:
         """Learn the scales of the parts, if they are standardised."""
         self.check_params()
-        self.mean_, self.scale_ = np.zeros(2), np.ones(2)
+        mean, scale = np.zeros(2), np.ones(2)
         if self.standardised:
             try:
                 parts = np.array([self._parts(e) for e in episodes])
@@ -89,9 +89,10 @@ class Ensemble(Scorer):
                 raise EpisodeError(
                     f"the reference has {len(parts)} episodes, at least 2 are needed"
                 )
-            self.mean_ = parts.mean(axis=0)
+            mean = parts.mean(axis=0)
             floor = [Smoothness.resolution, GripperTiming.resolution]
-            self.scale_ = np.maximum(parts.std(axis=0), floor)
+            scale = np.maximum(parts.std(axis=0), floor)
+        self.mean_, self.scale_ = mean, scale
         return self
 
     def look(self, episode: Episode) -> Look:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from dataclasses import fields, replace
-from typing import get_args
+from functools import partial
 
 import numpy as np
 import pytest
-from episodes import copied, make_episode, make_pool, moved, shifted, with_fields
+from episodes import copied, make_episode, make_pool, moved, with_fields
 from streams import samples_of
 
 from curation_ros.bags import CdrDecoder
@@ -16,10 +17,15 @@ from curation_ros.core.episode.builder import EpisodeBuilder
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.stream import Messages, SampleBlock
 from curation_ros.core.errors import EpisodeError, NotFittedError
-from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, Abstain, Need, PoolScorer, Scorer
+from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, Abstain, PoolScorer, Scorer
 from curation_ros.core.scorers.ensemble import Ensemble
 from curation_ros.core.scorers.features import start_state
+from curation_ros.core.scorers.gripper_timing import GripperTiming
 from curation_ros.core.scorers.knn import NearestNeighbours
+from curation_ros.core.scorers.length import Length
+from curation_ros.core.scorers.smoothness import Smoothness
+from curation_ros.core.scorers.trajectory_alignment import TrajectoryAlignment
+from curation_ros.testing.scorers import check_scorer
 
 NAMES = list(SCORERS)
 POOLED = [name for name in NAMES if SCORERS[name].needs == "dataset"]
@@ -49,42 +55,6 @@ def state_bytes(scorer: Scorer) -> str:
         return repr(sorted(vars(scorer).items()))
 
 
-def test_parameters_are_keyword_only_with_defaults_and_stored_unchanged(name: str) -> None:
-    parameters = [p for p in inspect.signature(SCORERS[name]).parameters.values()]
-    assert all(p.kind is p.KEYWORD_ONLY and p.default is not p.empty for p in parameters)
-    given = {p.name: p.default for p in parameters}
-    assert SCORERS[name](**given).params() == given
-
-
-def test_construction_learns_nothing(name: str) -> None:
-    assert SCORERS[name]().fitted() == {}
-
-
-def test_declares_what_it_needs(name: str) -> None:
-    assert SCORERS[name].needs in get_args(Need)
-    assert issubclass(SCORERS[name], PoolScorer) == (SCORERS[name].needs == "dataset")
-    assert SCORERS[name].resolution >= 0
-    assert SCORERS[name]().resolution > 0
-
-
-def test_score_before_fit_raises_where_a_reference_is_needed(
-    name: str, rng: np.random.Generator
-) -> None:
-    scorer = SCORERS[name]()
-    if scorer.needs in LEARNS_NOTHING:
-        assert np.isfinite(scorer.score(make_episode(rng)))
-    else:
-        with pytest.raises(NotFittedError):
-            scorer.score(make_episode(rng))
-
-
-def test_fit_returns_self_and_learned_values_are_plain(fitted: Scorer, name: str) -> None:
-    scorer = SCORERS[name]()
-    assert scorer.fit(make_pool(np.random.default_rng(1), 6)) is scorer
-    for value in fitted.fitted().values():
-        assert isinstance(value, (np.ndarray, int, float, str, tuple, type(None)))
-
-
 def test_empty_reference_is_refused_where_one_is_needed(name: str) -> None:
     scorer = SCORERS[name]()
     if scorer.needs not in LEARNS_NOTHING:
@@ -93,54 +63,23 @@ def test_empty_reference_is_refused_where_one_is_needed(name: str) -> None:
         assert scorer.fitted() == {}
 
 
-def test_score_is_a_finite_float_and_changes_nothing(
-    fitted: Scorer, rng: np.random.Generator
-) -> None:
-    episode = make_episode(rng)
-    state, digest = state_bytes(fitted), episode.digest
-    first = fitted.look(episode)
-    assert type(first.score) is float
-    assert np.isfinite(first.score)
-    assert fitted.look(episode) == first
-    assert fitted.look(replace(episode)) == first  # nor does it rest on what was asked before
-    assert fitted.score(episode) == first.score
-    assert state_bytes(fitted) == state
-    assert episode.digest == digest
+def test_rules_of_every_scorer_are_kept(name: str) -> None:
+    check_scorer(SCORERS[name])
 
 
-def test_fit_changes_no_reference_episode(name: str, reference: list[Episode]) -> None:
-    digests = [e.digest for e in reference]
-    SCORERS[name]().fit(reference)
-    assert [e.digest for e in reference] == digests
-
-
-def test_score_is_the_same_alone_and_in_a_batch(fitted: Scorer, rng: np.random.Generator) -> None:
-    batch = [make_episode(rng, 230 + k, open_at=130 + 9 * k) for k in range(8)]
-    forwards = [fitted.score(e) for e in batch]
-    backwards = [fitted.score(e) for e in reversed(batch)][::-1]
-    assert forwards == backwards
-
-
-def test_refit_forgets(name: str, reference: list[Episode], rng: np.random.Generator) -> None:
-    other = [moved(make_episode(rng, 300, noise=0.2, close_at=60), 0.1 * k) for k in range(7)]
-    fresh = SCORERS[name]().fit(reference)
-    refitted = SCORERS[name]().fit(other).fit(reference)
-    assert state_bytes(refitted) == state_bytes(fresh)
-
-
-def test_copied_episode_scores_the_same(fitted: Scorer, rng: np.random.Generator) -> None:
-    episode = make_episode(rng)
-    assert fitted.score(copied(episode)) == fitted.score(episode)
-    assert fitted.score(copied(episode, id="another", name="x")) == fitted.score(episode)
-
-
-def test_shift_of_all_stamps_changes_nothing(
-    name: str, reference: list[Episode], rng: np.random.Generator
-) -> None:
-    episode = make_episode(rng)
-    here = SCORERS[name]().fit(reference)
-    there = SCORERS[name]().fit([shifted(e, HOUR_NS) for e in reference])
-    assert there.look(shifted(episode, HOUR_NS)) == here.look(episode)
+@pytest.mark.parametrize(
+    "make",
+    [
+        partial(Ensemble, standardised=True),
+        partial(NearestNeighbours, few="abstain"),
+        partial(GripperTiming, on="fingers", never="abstain"),
+        partial(TrajectoryAlignment, of="flattened"),
+        partial(Length, of="path"),
+        partial(Smoothness, profile="change"),
+    ],
+)
+def test_rules_are_kept_with_other_parameters(make: Callable[[], Scorer]) -> None:
+    check_scorer(make)
 
 
 def test_live_equals_bag(fitted: Scorer, rng: np.random.Generator) -> None:
@@ -238,11 +177,6 @@ def test_steps_of_a_look_lie_in_the_episode(
         assert look.steps is not None
         assert look.broke_at == 140
         assert look.explanation is not None
-
-
-def test_subclasses_override_look_alone(name: str) -> None:
-    assert SCORERS[name].score is Scorer.score
-    assert SCORERS[name].look is not Scorer.look
 
 
 def test_labels_have_no_way_in(name: str) -> None:

@@ -1,0 +1,1 @@
+"""Conformance checks: what a class of another package must do, as functions to call in a test."""
