@@ -32,9 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 from one_core import rows_of
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.core.episode.phases import PHASES
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 from curation_ros.study.collect import Collection, collect
 from policy_node.policy import Policy
 from policy_node.rollouts import SimController, rollout

@@ -28,7 +28,6 @@ from typing import Any
 
 import numpy as np
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.rules import RULES
@@ -42,6 +41,7 @@ from curation_ros.core.scorers import SCORERS, Abstain
 from curation_ros.core.statistics.intervals import clopper_pearson
 from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 from curation_ros.study.collect import Collection, collect
 from sim_node.defects import DEFECTS
 

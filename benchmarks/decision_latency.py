@@ -22,7 +22,7 @@ from recorded import record
 from robot import Robot, stamped
 from rows import row
 
-from curation_ros.bags.reader import open_bag
+from curation_ros.bags import open_bag
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.episode.identity import new_episode_id
 from curation_ros.core.episode.status import EpisodeEvent

@@ -27,7 +27,7 @@ from one_core import rows_of
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from curation_ros.bags import BagWriter, open_bag, read_episode
+from curation_ros.bags import BagWriter, open_bag
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.episode.episode import Episode
@@ -35,6 +35,7 @@ from curation_ros.core.episode.identity import new_episode_id
 from curation_ros.core.episode.status import EpisodeEvent, event_to_json
 from curation_ros.core.episode.topic_map import TopicMap, topic_map_from_json
 from curation_ros.core.types import NS_PER_S
+from curation_ros.dataset.episodes import read_episode
 
 COMMAND = "python benchmarks/decoding.py"
 N_ROUNDS = 9

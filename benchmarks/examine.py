@@ -82,7 +82,8 @@ def measure(tree: Path, *, is_old: bool, n_references: int) -> dict[str, Any]:
     package = importlib.import_module("curation_ros")
     if tree not in Path(str(package.__file__)).resolve().parents:
         raise SystemExit(f"expected curation_ros of {tree}, found {package.__file__}")
-    read_episode = importlib.import_module("curation_ros.bags.reader").read_episode
+    home = "curation_ros.bags.reader" if is_old else "curation_ros.dataset.episodes"
+    read_episode = importlib.import_module(home).read_episode
     reference = references(read_episode(tree / _SAMPLE), n_references)
     examine = (old_examine if is_old else new_examine)(tree, reference)
     seconds = []

@@ -15,10 +15,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.batch.workers import spread
 from curation_ros.core.statistics.intervals import clopper_pearson
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 from curation_ros.study.collect import Collection, collect
 from policy_node.batch_training import FailedTraining, TrainingJob, train_many
 from policy_node.policy import Policy

@@ -17,7 +17,7 @@ import streams
 import yaml
 from rows import row
 
-from curation_ros.bags.reader import open_bag
+from curation_ros.bags import open_bag
 from curation_ros.core.episode.topic_map import topic_map_from_json
 from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset

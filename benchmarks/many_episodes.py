@@ -19,7 +19,7 @@ from typing import Any
 from one_core import environment
 from rows import row
 
-from curation_ros.bags.reader import Bag, open_bag
+from curation_ros.bags import Bag, open_bag
 from curation_ros.bags.schemas import MessageSchema
 from curation_ros.bags.writer import BagWriter
 from curation_ros.core.episode.identity import new_episode_id

@@ -15,7 +15,7 @@ import streams
 import yaml
 from rows import row
 
-from curation_ros.bags.reader import open_bag
+from curation_ros.bags import open_bag
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.nodes.processes import Domain, Nodes
 

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from rows import row
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.batch.audit import PAPER
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.scorers import SCORERS, Scorer
+from curation_ros.dataset.episodes import read_episode
 
 COMMAND = "python benchmarks/run.py scorer_cost"
 N_STEPS = 350

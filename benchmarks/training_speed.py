@@ -21,9 +21,9 @@ import torch
 from one_core import rows_of
 from torch.utils.data import DataLoader, TensorDataset
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.types import Span
+from curation_ros.dataset.episodes import read_episode
 from policy_node.batch_training import GROUP, TrainingJob, train_many
 from policy_node.train import Settings, TrainedPolicy, TrainingSet, new_network, train
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import yaml
 
-from curation_ros.bags.reader import find_bags, read_episode
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.rules import RULES, Rule
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap, read_topic_map
 from curation_ros.core.errors import ConfigError
+from curation_ros.dataset.episodes import find_bags, read_episode
 
 _SOURCE = Path(__file__).resolve().parents[1]
 #: What YAML must hold for each keyword of Curation.

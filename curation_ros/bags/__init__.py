@@ -1,8 +1,12 @@
 """MCAP bags: definitions, CDR decoding, writing, reading and recovery; no ROS needed."""
 
+from curation_ros.bags.bag import Bag
 from curation_ros.bags.cdr import CdrDecoder
+from curation_ros.bags.episodes import episode_event, episode_of
+from curation_ros.bags.errors import TornFileError
+from curation_ros.bags.folders import is_bag
 from curation_ros.bags.qos import QosProfile
-from curation_ros.bags.reader import Bag, episode_of, find_bags, open_bag, read_episode
+from curation_ros.bags.reader import open_bag
 from curation_ros.bags.recovery import RecoveryReport, recover_bag
 from curation_ros.bags.schemas import MessageSchema, message_schema
 from curation_ros.bags.writer import BagWriter
@@ -14,10 +18,11 @@ __all__ = [
     "MessageSchema",
     "QosProfile",
     "RecoveryReport",
+    "TornFileError",
+    "episode_event",
     "episode_of",
-    "find_bags",
+    "is_bag",
     "message_schema",
     "open_bag",
-    "read_episode",
     "recover_bag",
 ]

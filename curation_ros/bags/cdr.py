@@ -1,12 +1,14 @@
 """Values out of CDR bytes: message by message, or a whole column of messages in one pass.
 
-One walk over a message, driven by its definition, finds where every value lies. `read_message`
-and irregular messages use it directly. For the rest the walk is done once: messages of the same
-length whose structural bytes (encapsulation, lengths, terminators, names that were looked up)
-equal those of a walked message have every value at the same place, so that NumPy can read the
-values of all of them as strided columns. What such a walk has found is kept for the next block,
-and `shared_decoder` keeps it for the next bag. Where texts vary in length there are too many such
-layouts: then `cdr_columns` walks over all messages at once.
+A walk over a message, driven by its definition, finds where every value lies. `read_message` and
+irregular messages use it directly. For other messages one walk serves many. Its structural bytes
+are the encapsulation, the lengths, the terminators, and the names that were looked up. Messages
+of the same length with the same structural bytes have every value at the same place, and NumPy
+reads the values of all of them as strided columns.
+
+A layout that was found is kept for the next block, and by `shared_decoder` for the next bag. Where
+texts vary in length there are too many layouts. Then `cdr_columns` walks over all messages at
+once.
 """
 
 from __future__ import annotations
@@ -14,100 +16,27 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from curation_ros.bags.cdr_columns import ColumnWalk, IrregularError
+from curation_ros.bags.cdr_layout import Layout, padded_width
 from curation_ros.bags.cdr_paths import ValuePath, resolve_path
-from curation_ros.bags.cdr_walk import SIZES, Leaf, Walk, least_sizes
-from curation_ros.bags.definitions import TEXTS, Definitions, full_type_name, parse_definition
+from curation_ros.bags.cdr_walk import Walk, least_sizes
+from curation_ros.bags.definitions import Definitions, full_type_name, parse_definition
 from curation_ros.bags.schemas import message_schema
 from curation_ros.core.episode.stream import Columns, Messages, rows_at
 from curation_ros.core.errors import EpisodeError
 
 _HEADER_TYPE = "std_msgs/msg/Header"
-_TEXT_CODES = frozenset(TEXTS.values())
 
 # Bytes that one vectorised pass copies at most (they stay in the cache of a processor), and
 # layouts that are kept or tried.
 _BLOCK_BYTES = 256 << 10
 _MAX_LAYOUTS = 8
 _MAX_CACHED = 512
-
-
-class _Run(NamedTuple):
-    """Numbers that lie side by side, for columns that stand side by side."""
-
-    code: str
-    at: int
-    column: int
-    n_columns: int
-
-
-class _Layout:
-    """What one walked message says about all that look alike.
-
-    Blocks of messages are (n, width) bytes, `width` the length rounded up to whole words.
-    """
-
-    def __init__(self, walk: Walk, leaves: Sequence[Leaf]) -> None:
-        self.order = walk.order
-        length = len(walk.data)
-        mask = np.zeros(_width(length), dtype=np.uint8)
-        for start, stop in walk.structure:
-            mask[start:stop] = 0xFF
-        expected = np.zeros(_width(length), dtype=np.uint8)
-        expected[:length] = np.frombuffer(walk.data, np.uint8)
-        self._mask = mask.view(np.uint64)
-        self._expected = expected.view(np.uint64)
-        self.runs: list[_Run] = []
-        self.texts: list[tuple[int, Leaf]] = []
-        for column, leaf in enumerate(leaves):
-            if leaf.code in _TEXT_CODES:
-                self.texts.append((column, leaf))
-                continue
-            last = self.runs[-1] if self.runs else _Run("", -1, -1, 0)
-            follows = (leaf.code, leaf.at, column) == (
-                last.code,
-                last.at + last.n_columns * SIZES.get(last.code, 0),
-                last.column + last.n_columns,
-            )
-            if follows:
-                self.runs[-1] = last._replace(n_columns=last.n_columns + 1)
-            else:
-                self.runs.append(_Run(leaf.code, leaf.at, column, 1))
-
-    def differing(self, block: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_] | None:
-        """(n,) which messages of a block have another layout; None: none has."""
-        wrong = (block.view(np.uint64) ^ self._expected) & self._mask
-        if not wrong.any():
-            return None
-        return np.asarray(wrong.any(axis=1))
-
-    def numbers(self, block: npt.NDArray[np.uint8], run: _Run) -> npt.NDArray[np.generic]:
-        """(n, n_columns) values of a run, of their own type, in a view of the block."""
-        code = "u1" if run.code == "?" else self.order + run.code
-        shape, strides = (len(block), run.n_columns), (block.shape[1], SIZES[run.code])
-        values: npt.NDArray[np.generic] = np.ndarray(shape, code, block, run.at, strides)
-        return values != 0 if run.code == "?" else values
-
-    @staticmethod
-    def text(block: npt.NDArray[np.uint8], leaf: Leaf) -> npt.NDArray[np.bytes_]:
-        """(n,) UTF-8 bytes at a leaf, in a view of the block."""
-        if not leaf.length:
-            return np.zeros(len(block), dtype="S1")
-        strides = (block.shape[1],)
-        texts: npt.NDArray[np.bytes_] = np.ndarray(
-            (len(block),), f"S{leaf.length}", block, leaf.at, strides
-        )
-        return texts
-
-
-def _width(length: int) -> int:
-    """Length of a message in whole words of 8 bytes."""
-    return -(-length // 8) * 8
 
 
 class CdrDecoder:
@@ -120,13 +49,13 @@ class CdrDecoder:
         """Make a decoder.
 
         Args:
-            definitions: message type -> `ros2msg` text of a bag's schema records. They win over
-                what is installed, which serves for all other types.
+            definitions: message type -> `ros2msg` text of a bag's schema records. Installed
+                definitions serve for all other types.
         """
         self._texts = {full_type_name(k): v for k, v in (definitions or {}).items()}
         self._walks: dict[str, tuple[Walk, Definitions]] = {}
         self._paths: dict[tuple[str, str], ValuePath] = {}
-        self._layouts: dict[tuple[str, tuple[str, ...], int], list[_Layout]] = {}
+        self._layouts: dict[tuple[str, tuple[str, ...], int], list[Layout]] = {}
         self._n_layouts: dict[tuple[str, tuple[str, ...]], int] = {}
 
     def has_header(self, type_name: str) -> bool:
@@ -138,15 +67,6 @@ class CdrDecoder:
         walk, definitions = self._walk(type_name)
         fields = definitions[walk.type_name]
         return bool(fields) and fields[0].base == _HEADER_TYPE and fields[0].kind == "one"
-
-    def check_path(self, type_name: str, path: str) -> None:
-        """Check a path of a topic map against a type.
-
-        Raises:
-            ConfigError: if the type has no such value, naming what it has.
-            BagError: if the type has no definition here.
-        """
-        self._path(type_name, path)
 
     def read_message(self, type_name: str, data: bytes) -> dict[str, Any]:
         """Decode a whole message.
@@ -174,11 +94,11 @@ class CdrDecoder:
             messages: CDR bytes with their encapsulation.
 
         Returns:
-            One (len(messages),) array a path: float64, or unicode for texts.
+            One (len(messages),) array per path: float64, or unicode for texts.
 
         Raises:
-            EpisodeError: if a message does not fit the type, or lacks the element or name that a
-                path asks for; of several the first.
+            EpisodeError: if a message does not fit the type, or lacks the element or name of a
+                path; of several messages the first.
             ConfigError: if the type has no such path.
             BagError: if the type has no definition here.
         """
@@ -189,7 +109,7 @@ class CdrDecoder:
         return [columns.texts.get(k, values[k]) for k in range(len(paths))]
 
     def decode_block(self, type_name: str, paths: Sequence[str], messages: Messages) -> Columns:
-        """Read the values at `paths` from every message, whatever is wrong with others.
+        """Read the values at `paths` from every message; bad messages do not spoil the others.
 
         Args:
             type_name: type of all messages.
@@ -224,12 +144,12 @@ class CdrDecoder:
 
     def start(
         self, type_name: str, paths: Sequence[ValuePath], length: int
-    ) -> tuple[Walk, list[_Layout]]:
+    ) -> tuple[Walk, list[Layout]]:
         """A general walk of a type, and the layouts that messages of a length have had so far."""
         if len(self._layouts) > _MAX_CACHED:
             self._layouts.clear()
         key = (type_name, tuple([path.text for path in paths]), length)
-        # A copy: a walk remembers where it is, and threads may share a decoder.
+        # A copy: a walk has a position, and threads may share a decoder.
         return copy.copy(self._walk(type_name)[0]), self._layouts.setdefault(key, [])
 
     def _walk(self, type_name: str) -> tuple[Walk, Definitions]:
@@ -320,19 +240,19 @@ class _Job:
         return column
 
     def decode(self, length: int, rows: npt.NDArray[np.int64]) -> None:
-        """Read messages of one length: as blocks of known layouts, what is left one by one."""
+        """Read messages of one length: as blocks of known layouts, and the rest one by one."""
         walk, layouts = self._decoder.start(self._type_name, self._paths, length)
         block = self._gather(rows, length)
         for layout in tuple(layouts):
             rows, block = self._read_alike(layout, block, rows)
             if not len(rows):
                 return
-        learned: list[_Layout] = []
+        learned: list[Layout] = []
         faults = 0
         while len(rows) and max(len(learned), faults) < _MAX_LAYOUTS:
             try:
                 tree = walk.run(self._messages[int(rows[0])])
-                layout = _Layout(walk, [walk.find(tree, path) for path in self._paths])
+                layout = Layout(walk, [walk.find(tree, path) for path in self._paths])
             except EpisodeError as err:
                 self._bad[int(rows[0])] = err
                 rows, block = rows[1:], block[1:]
@@ -347,7 +267,7 @@ class _Job:
 
     def _gather(self, rows: npt.NDArray[np.int64], length: int) -> npt.NDArray[np.uint8]:
         """(n, width) bytes of messages of one length."""
-        width = _width(length)
+        width = padded_width(length)
         if not width:
             return np.empty((len(rows), 0), dtype=np.uint8)
         buffer, starts = self._messages.buffer, self._messages.starts[rows]
@@ -356,7 +276,7 @@ class _Job:
         return rows_at(buffer, starts, width)
 
     def _read_alike(
-        self, layout: _Layout, block: npt.NDArray[np.uint8], rows: npt.NDArray[np.int64]
+        self, layout: Layout, block: npt.NDArray[np.uint8], rows: npt.NDArray[np.int64]
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint8]]:
         """Read those messages of a block that have a layout, and return the others."""
         differing = layout.differing(block)
@@ -370,7 +290,7 @@ class _Job:
         return rows, block
 
     def _read_block(
-        self, layout: _Layout, block: npt.NDArray[np.uint8], rows: npt.NDArray[np.int64]
+        self, layout: Layout, block: npt.NDArray[np.uint8], rows: npt.NDArray[np.int64]
     ) -> None:
         whole = len(rows) == len(self._messages)
         for run in layout.runs:

@@ -1,9 +1,9 @@
 """The walk over the CDR bytes of many messages at once, where texts differ in length.
 
-It follows the general walk step by step, with a place a message instead of one place, and accepts
-a message only if the general walk would: lists must have as many elements as in the first
-message, and names that were looked up must be its names. Whoever is not accepted is left to the
-general walk, which also says what is wrong.
+It follows the general walk step by step, with one place per message instead of one place. It
+accepts a message only if the general walk would, if its lists have as many elements as in the
+first message, and if the names that were looked up are the same. Other messages are left to the
+general walk, which also reports what is wrong.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from curation_ros.bags.cdr_walk import SIZES, Walk
 from curation_ros.bags.definitions import PRIMITIVES, TEXTS, Field
 from curation_ros.core.episode.stream import Messages, Stamps, rows_at
 
-#: A place or length in bytes: the same in all messages, or (n,) one a message.
+#: A place or length in bytes: the same in all messages, or (n,) one per message.
 _Place: TypeAlias = int | Stamps
 
 # Lists of messages with more elements, and texts that are longer, are left to the general walk.
@@ -75,7 +75,7 @@ class ColumnWalk:
         self.fits = (heads == heads[0]).all(axis=1)
         self._at: _Place = 4
         tree = self._members(self._type_name)
-        # Places only ever grow: who is inside at the end has never been outside.
+        # Places only grow: a place inside at the end was never outside.
         self.fits &= self._at <= self._sizes
         if not self.fits[0]:
             raise IrregularError
@@ -85,7 +85,7 @@ class ColumnWalk:
         """(n,) numbers at a place; of messages that end before it, any."""
         view = self._views.get(code)
         if view is None:
-            # A number at every byte: picking from it copies only those that are wanted.
+            # A number at every byte, of which only the wanted ones are copied.
             n_places = len(self._buffer) - SIZES[code] + 1
             view = np.ndarray((n_places,), self._order + code, self._buffer, 0, (1,))
             self._views[code] = view
@@ -160,7 +160,7 @@ class ColumnWalk:
         return Leaves(TEXTS[field.base], start, length)
 
     def find(self, tree: dict[str, Any], path: ValuePath) -> Leaves:
-        """The leaves that a path leads to; who has other names there is not accepted.
+        """The leaves that a path leads to; messages with other names there are not accepted.
 
         Raises:
             IrregularError: if the first message does not have them.

@@ -24,7 +24,7 @@ PRIMITIVES = {
     "float32": "f",
     "float64": "d",
 }
-#: Text types and the codes that we give them.
+#: Text types and their codes here.
 TEXTS = {"string": "s", "wstring": "w"}
 
 SEPARATOR = "=" * 80

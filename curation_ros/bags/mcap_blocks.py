@@ -1,8 +1,8 @@
 """Messages of whole MCAP files as arrays, found by the indexes of their chunks.
 
-They are those of `curation_ros.bags.mcap_file.walk`, in its order. An index is believed only as
-far as what it says can be checked: with the few records between them, its messages must tile the
-chunk, and all of them sum up to the statistics. Else the chunk, or the file, is walked.
+The messages are those of `curation_ros.bags.mcap_file.walk`, in its order. An index is used only
+if it can be checked. Its messages and the few records between them must tile the chunk, and the
+counts must sum up to the statistics. Otherwise the chunk, or the file, is walked.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
 
+from curation_ros.bags.errors import TornFileError
 from curation_ros.bags.mcap_file import (
     MAGIC,
     MAX_RECORD_BYTES,
     MESSAGE,
     PARSERS,
     RECORD,
-    McapInfo,
     Message,
     Record,
-    TornFileError,
     chunk_records,
     open_mcap,
     parse_record,
     unpack_chunk,
     walk,
 )
+from curation_ros.bags.mcap_info import McapInfo
 from curation_ros.core.episode.stream import Messages, rows_at
 from curation_ros.core.errors import BagError
 
@@ -50,20 +50,21 @@ _MESSAGE_HEAD = np.dtype(
     ]
 )
 _ENTRY_BYTES = 16
-# Files up to this size are read at once; blocks of messages end after so much that they still
+# Files up to this size are read at once. Blocks of messages end at the second size, so that they
 # stay in the cache of a processor while they are decoded.
 _SMALL_BYTES = 4 << 20
 _BLOCK_BYTES = 1 << 20
 # How many times the bytes of its messages a block may keep in memory.
 _MOST_UNWANTED = 8
 
-# glibc returns memory to the system above a threshold, and then faults it in anew, page by page,
-# for every bag: a fifth of the time of reading one. Freeing a large block raises that threshold.
+# glibc returns memory to the system above a threshold, and then faults it in again, page by page,
+# for every bag. That takes a fifth of the time of reading. Freeing a large block raises the
+# threshold.
 np.empty(_SMALL_BYTES, dtype=np.uint8)
 
 
 class MessageBlock(NamedTuple):
-    """Messages of some channels in file order; every array has a value a message, int64."""
+    """Messages of some channels in file order; every array has one int64 per message."""
 
     channels: npt.NDArray[np.int64]
     sequences: npt.NDArray[np.int64]
@@ -72,7 +73,7 @@ class MessageBlock(NamedTuple):
     messages: Messages
 
     def take(self, rows: npt.NDArray[np.int64] | slice) -> MessageBlock:
-        """Some of the messages; for a slice without a copy."""
+        """Some of the messages; a slice is not copied."""
         return MessageBlock(
             self.channels[rows],
             self.sequences[rows],
@@ -89,11 +90,11 @@ def read_blocks(path: Path, info: McapInfo, channels: Collection[int]) -> Iterat
 
     Args:
         path: the file.
-        info: what `read_info` said about it.
+        info: what `read_info` returned for it.
         channels: ids of the wanted channels.
 
     Raises:
-        TornFileError: if the file is damaged, or its index leaves out messages that are there.
+        TornFileError: if the file is damaged, or its index leaves out messages.
         BagError: if the file is no MCAP file, or cannot be read.
     """
     with open_mcap(path) as stream:
@@ -257,7 +258,7 @@ def _split_by_index(
     """The wanted messages of unpacked chunks; None where the index does not fit them."""
     sizes = np.array([len(chunk.data) for chunk in chunks], dtype=np.int64)
     stops = np.cumsum(sizes)
-    # Some bytes more: whoever gathers whole words reads beyond the last message.
+    # Some bytes more, because gathering whole words reads beyond the last message.
     buffer = np.frombuffer(b"".join([*(chunk.data for chunk in chunks), bytes(8)]), np.uint8)
     ids = [channel for chunk in chunks for channel in chunk.entries]
     raws = [raw for chunk in chunks for raw in chunk.entries.values()]
@@ -287,7 +288,7 @@ def _split_by_index(
         rows = np.isin(channels, list(wanted))
         heads, channels, messages = heads[rows], channels[rows], messages.take(rows)
     if len(buffer) > _MOST_UNWANTED * int(messages.sizes.sum()):
-        messages = messages.compact()  # else some poses would keep the images beside them
+        messages = messages.compact()  # otherwise a few poses would keep the images between them
     return MessageBlock(
         channels.astype(np.int64),
         heads["sequence"].astype(np.int64),

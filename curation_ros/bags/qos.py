@@ -1,4 +1,4 @@
-"""Quality of service of a topic, as rosbag2 stores it (metadata version 9: names, not numbers)."""
+"""Quality of service of a topic, as rosbag2 stores it in metadata version 9: by names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from curation_ros.bags.yaml_text import dump_yaml, load_yaml
 _INFINITE_NS = 9_223_372_036_854_775_807
 _NS_PER_S = 1_000_000_000
 
-# Numbers of rmw/types.h, which bags before version 9 have in place of names.
+# Numbers of rmw/types.h, which bags before version 9 have instead of names.
 _NAMES: dict[str, dict[int, str]] = {
     "history": {0: "system_default", 1: "keep_last", 2: "keep_all", 3: "unknown"},
     "reliability": {
@@ -102,7 +102,7 @@ def qos_to_yaml(profiles: tuple[QosProfile, ...]) -> str:
 
 
 def qos_from_yaml(text: str) -> tuple[QosProfile, ...]:
-    """Read the channel metadata `offered_qos_profiles`; empty where it is no such list."""
+    """Read the channel metadata `offered_qos_profiles`; empty if it is no such list."""
     try:
         raw = load_yaml(text)
         return tuple(QosProfile.from_rosbag2(item) for item in raw or ())

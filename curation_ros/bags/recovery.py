@@ -1,4 +1,4 @@
-"""Saves what an interrupted recording has left; the original is never changed."""
+"""Saves what an interrupted recording has left, and never changes the original."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from pathlib import Path
 from mcap.records import Channel, Metadata, Schema
 
 from curation_ros.bags.definitions import full_type_name
-from curation_ros.bags.mcap_file import Message, TornFileError, walk
+from curation_ros.bags.errors import TornFileError
+from curation_ros.bags.mcap_file import Message, walk
 from curation_ros.bags.qos import qos_from_yaml
 from curation_ros.bags.schemas import MessageSchema
 from curation_ros.bags.writer import BagWriter
@@ -18,7 +19,7 @@ from curation_ros.bags.yaml_text import load_yaml
 from curation_ros.core.errors import BagError
 from curation_ros.files import sync_folder
 
-#: What the tail of a file is called that has nothing wrong with it.
+#: The tail of a file that has nothing wrong with it.
 COMPLETE = "complete"
 
 
@@ -42,19 +43,18 @@ class RecoveryReport:
 def recover_bag(
     source: Path,
     target_dir: Path,
-    custom_data: Mapping[str, str] | None = None,
     *,
     scratch: Path | None = None,
 ) -> RecoveryReport:
     """Copy every complete message of an interrupted bag into a new one.
 
-    The new bag appears at `target_dir` in one step, when it is whole.
+    The new bag appears at `target_dir` in one step, when it is whole. Its custom data are those of
+    the interrupted bag with `recovered` (`true`), `recovered_messages` (a number) and
+    `recovered_tail` (why reading stopped).
 
     Args:
         source: folder of the interrupted bag, or its .mcap file.
         target_dir: folder of the new bag; must not exist.
-        custom_data: added to that of the interrupted bag, beside `recovered` (`true`),
-            `recovered_messages` (a number) and `recovered_tail` (why reading stopped).
         scratch: where the new bag grows, on the file system of `target_dir`; None: a hidden folder
             beside it. What an interrupted recovery has left there is removed.
 
@@ -65,7 +65,7 @@ def recover_bag(
     if target_dir.exists():
         raise BagError(f"{target_dir} exists already; a bag is never overwritten")
     scratch = scratch or target_dir.with_name(f".{target_dir.name}.recovering")
-    # What an interrupted recovery has left is a copy; the original is still there.
+    # An interrupted recovery leaves a copy, of which the original is still there.
     shutil.rmtree(scratch, ignore_errors=True)
     try:
         next(walk(path), None)
@@ -73,7 +73,7 @@ def recover_bag(
         raise BagError(f"{path} holds nothing to recover: {err.reason}") from err
     writer = BagWriter(scratch, path.stem.removesuffix("_0"))
     try:
-        report = _copy(path, writer, target_dir, dict(custom_data or {}))
+        report = _copy(path, writer, target_dir)
         scratch.rename(target_dir)
         sync_folder(target_dir.parent)
     except OSError as err:
@@ -93,9 +93,7 @@ def _only_mcap(source: Path) -> Path:
     return found[0]
 
 
-def _copy(
-    path: Path, writer: BagWriter, target_dir: Path, custom_data: dict[str, str]
-) -> RecoveryReport:
+def _copy(path: Path, writer: BagWriter, target_dir: Path) -> RecoveryReport:
     schemas: dict[int, Schema] = {}
     topics: dict[int, str] = {}
     found: dict[str, str] = {}
@@ -128,7 +126,7 @@ def _copy(
         "recovered_messages": str(total),
         "recovered_tail": tail,
     }
-    all_data = {**found, **custom_data, **recovered}
+    all_data = {**found, **recovered}
     writer.close(all_data)
     return RecoveryReport(target_dir, writer.counts, tail, all_data)
 

@@ -61,7 +61,7 @@ def _installed_schema(type_name: str) -> MessageSchema | None:
     text = head[1] + "".join(
         f"\n{SEPARATOR}\nMSG: {name.replace('/msg/', '/')}\n{body}" for name, body in rest
     )
-    # The file's own hash is what the graph announces; for two types rosbags computes another.
+    # The graph announces the hash of this file. For two types rosbags computes another one.
     path = folder / f"{type_name.split('/')[2]}.json"
     try:
         hashes = {

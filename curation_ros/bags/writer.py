@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Literal, cast
+from typing import IO, Any, cast
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
-from curation_ros.bags.mcap_file import OWN_METADATA
+from curation_ros.bags.mcap_info import OWN_METADATA
 from curation_ros.bags.qos import QosProfile, qos_to_yaml
 from curation_ros.bags.schemas import MessageSchema, message_schema
 from curation_ros.bags.yaml_text import dump_yaml
@@ -25,12 +25,9 @@ from curation_ros.version import __version__
 #: Bytes of messages after which a chunk is written without being asked to flush.
 CHUNK_BYTES = 256 * 1024
 
-Compression = Literal["zstd", "lz4", "none"]
-_COMPRESSIONS = {
-    "zstd": CompressionType.ZSTD,
-    "lz4": CompressionType.LZ4,
-    "none": CompressionType.NONE,
-}
+#: Of the chunks.
+COMPRESSION = CompressionType.ZSTD
+_ROS_DISTRO = "jazzy"
 
 
 @dataclass
@@ -83,17 +80,13 @@ class BagWriter:
         name: str,
         *,
         custom_data: Mapping[str, str] | None = None,
-        compression: Compression = "zstd",
-        ros_distro: str = "jazzy",
     ) -> None:
-        """Create the folder and the file; this is also the claim that nobody else writes it.
+        """Create the folder and the file; this also claims the bag, because the folder is new.
 
         Args:
             directory: folder of the bag; must not exist.
             name: the file is `<name>_0.mcap`.
-            custom_data: what is known now, for whoever recovers the bag after a crash.
-            compression: of the chunks.
-            ros_distro: as rosbag2's metadata has it.
+            custom_data: what is known now; it survives if the bag must be recovered after a crash.
 
         Raises:
             BagError: if the folder exists, or cannot be written.
@@ -101,7 +94,6 @@ class BagWriter:
         self.directory = directory
         self.path = directory / f"{name}_0.mcap"
         self._custom_data = dict(custom_data or {})
-        self._ros_distro = ros_distro
         self._topics: dict[str, _Topic] = {}
         self._schema_ids: dict[tuple[str, str], int] = {}
         self._start_ns = self._end_ns = self._total = 0
@@ -116,7 +108,7 @@ class BagWriter:
         self._mcap = McapWriter(
             cast("IO[Any]", self._file),
             chunk_size=CHUNK_BYTES,
-            compression=_COMPRESSIONS[compression],
+            compression=COMPRESSION,
         )
         self._open = True
         try:
@@ -131,11 +123,6 @@ class BagWriter:
         """Topic -> messages written."""
         return {name: topic.count for name, topic in self._topics.items()}
 
-    @property
-    def size_bytes(self) -> int:
-        """Bytes in the file so far; messages of the chunk in progress are not among them."""
-        return self._file.tell()
-
     def add_topic(
         self,
         name: str,
@@ -143,13 +130,13 @@ class BagWriter:
         qos: Sequence[QosProfile] = (),
         schema: MessageSchema | None = None,
     ) -> None:
-        """Announce a topic; the same again changes nothing.
+        """Add a topic; adding it again changes nothing.
 
         Args:
             name: resolved name, such as `/joint_states`.
             type_name: such as `sensor_msgs/msg/JointState`.
             qos: what its publishers offer.
-            schema: its definition; found on this machine where it is not given.
+            schema: its definition; None: the one that is found on this machine.
 
         Raises:
             BagError: if the topic has another type already, no definition is found, or the disk
@@ -225,7 +212,7 @@ class BagWriter:
         found.count += 1
 
     def flush(self) -> None:
-        """Hand everything so far to the system: a crash of this process loses nothing of it.
+        """Hand everything so far to the system, where it survives a crash of this process.
 
         Raises:
             BagError: if the disk fails.
@@ -262,7 +249,7 @@ class BagWriter:
             raise self._failed(err) from err
 
     def abandon(self) -> None:
-        """Leave the file as it is; after a failure, or when the episode is not wanted."""
+        """Leave the file as it is, after a failure or if the episode is not wanted."""
         self._open = False
         with suppress(OSError):
             self._file.close()
@@ -272,7 +259,7 @@ class BagWriter:
             raise BagError(f"{self.path} is closed: nothing more can be written to it")
 
     def _failed(self, err: OSError) -> BagError:
-        # The chunk in progress is lost, so going on would leave a hole in silence.
+        # The chunk in progress is lost. Writing on would leave an unnoticed hole.
         self._open = False
         return BagError(f"{err.filename or self.path}: {err.strerror or err}")
 
@@ -311,7 +298,7 @@ class BagWriter:
                 }
             ],
             "custom_data": dict(self._custom_data),
-            "ros_distro": self._ros_distro,
+            "ros_distro": _ROS_DISTRO,
         }
 
     def _write_metadata_record(self) -> None:
@@ -329,8 +316,8 @@ def own_metadata(
 ) -> dict[str, str]:
     """What the record OWN_METADATA of a finished bag holds.
 
-    To parse the YAML of rosbag2 takes longer than to read an episode. So the record repeats what
-    we need of it, and is believed beside the metadata.yaml whose digest it names.
+    Parsing the YAML of rosbag2 takes longer than reading an episode. So the record repeats what is
+    needed of it. It is valid only together with the metadata.yaml whose digest it has.
 
     Args:
         custom_data: of rosbag2's metadata.

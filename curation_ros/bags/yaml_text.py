@@ -10,9 +10,9 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
-#: Metadata are some kB, and some hundred values; beyond this a text is no metadata but a trap.
+#: Metadata have some kB and some hundred values. Beyond these limits a text is a trap.
 MOST_BYTES, MOST_VALUES, MOST_NESTED = 16 << 20, 200_000, 100
-#: What opens a level on one line; without many of them, so small a text cannot be nested deeply.
+#: What opens a level on one line. A small text without many of them cannot be nested deeply.
 _OPENERS = (b"[", b"{", b"- ", b"-\t", b"? ", b"?\t")
 _FEW_OPENERS, _SMALL_BYTES = 500, 50_000
 
@@ -40,7 +40,7 @@ def load_yaml(text: str | bytes) -> Any:
 
 
 def _check_nesting(text: str | bytes) -> None:
-    """Refuse what is nested too deep: libyaml's loader recurses until the stack is full."""
+    """Refuse a text that is nested too deep: libyaml's loader recurses until the stack is full."""
     depth = 0
     for event in yaml.parse(text, Loader=_LOADER):
         if isinstance(event, yaml.CollectionStartEvent):
@@ -68,7 +68,7 @@ def _check_unfolded(data: Any) -> None:
 def dump_yaml(data: Any) -> str:
     """YAML text of plain data, keys in their order.
 
-    Lines are never folded: that is legal, but not every reader of rosbag2 metadata unfolds them.
+    Lines are never folded. Folding is legal, but not every reader of rosbag2 metadata unfolds.
     """
     text = yaml.dump(data, Dumper=_DUMPER, sort_keys=False, width=2**30, allow_unicode=True)
     return str(text)

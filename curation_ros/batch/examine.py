@@ -13,7 +13,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.batch.workers import WorkerDiedError, check_workers, spread
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import Decision, untrustworthy
@@ -24,6 +23,7 @@ from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import CurationError
+from curation_ros.dataset.episodes import read_episode
 from curation_ros.dataset.index import Index
 from curation_ros.dataset.layout import home_of
 from curation_ros.version import __version__

@@ -14,7 +14,6 @@ from rich.progress import track
 from rich.table import Table
 from rich.text import Text
 
-from curation_ros.bags.reader import find_bags
 from curation_ros.batch.examine import EpisodesOf, Examined, Examiner, judge_bags
 from curation_ros.cli.arguments import add_config, add_reference, add_rule, add_workers
 from curation_ros.cli.output import VERDICT_STYLE, console, print_json, progress_console, warn
@@ -28,6 +27,7 @@ from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import find_bags
 from curation_ros.dataset.layout import home_of, is_dataset
 from curation_ros.live.curator import log_decision
 

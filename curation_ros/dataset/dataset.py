@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from curation_ros.bags.reader import Bag, episode_of, hint_of_datasets, open_bag
+from curation_ros.bags import Bag, episode_of, open_bag
 from curation_ros.core.decision.decision import Decision, in_force
 from curation_ros.core.decision.manifest import Manifest
 from curation_ros.core.decision.ties import TieKey, tie_key
@@ -23,6 +23,7 @@ from curation_ros.core.episode.identity import resolve_prefix
 from curation_ros.core.errors import CurationError, EpisodeError
 from curation_ros.dataset import layout
 from curation_ros.dataset.index import Index, IndexedEpisode, SpoiltIndexError
+from curation_ros.dataset.layout import hint_of_datasets
 from curation_ros.dataset.partials import PartialBags
 from curation_ros.dataset.truth import TruthLog
 from curation_ros.files import (

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from curation_ros.bags.reader import open_bag
+from curation_ros.bags import open_bag
 from curation_ros.core.decision.decision import CURATOR, Decision, in_force
 from curation_ros.core.decision.manifest import Entry, Manifest
 from curation_ros.core.errors import ConfigError, CurationError

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 EPISODES = "episodes"
@@ -16,6 +17,7 @@ QUARANTINE = "quarantine"
 INDEX = "index.sqlite"
 #: The lock of a folder, in the folder; a claimed partial bag has a lock beside it, `<id>.lock`.
 LOCK = ".lock"
+_MOST_HINTS = 3
 
 
 def is_dataset(folder: Path) -> bool:
@@ -34,3 +36,12 @@ def home_of(bag: Path) -> tuple[Path, str]:
     if folder.name == EPISODES:
         return folder.parent, f"{EPISODES}/{name}"
     return folder, name
+
+
+def hint_of_datasets(folder: Path) -> str:
+    """`: did you mean DATASET?` if there are datasets in a folder that is none; else empty."""
+    with suppress(OSError):
+        inside = sorted(entry for entry in folder.iterdir() if is_dataset(entry))
+        if inside:
+            return f": did you mean {' or '.join(map(str, inside[:_MOST_HINTS]))}?"
+    return ""

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 
-from curation_ros.bags.reader import episode_of, open_bag, read_episode
+from curation_ros.bags import episode_of, open_bag
 from curation_ros.core.decision.balance import Balance, balance_of, phase_steps
 from curation_ros.core.decision.decision import CURATOR, Decision, in_force, untrustworthy
 from curation_ros.core.decision.manifest import Entry, Manifest
@@ -19,6 +19,7 @@ from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.scorers import find_scorer, is_scorer
 from curation_ros.core.types import Span
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 
 
 def save_selection(

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.batch.examine import EpisodesOf, Examiner, judge_bags, with_copy
 from curation_ros.core.decision import decision as decisions
 from curation_ros.core.decision.curation import Curation
@@ -26,6 +25,7 @@ from curation_ros.core.errors import CurationError, EpisodeError
 from curation_ros.core.evidence.alerts import AlertWatch
 from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 
 #: An episode that runs is looked at for alerts this often, by its own clock.
 ALERT_PERIOD_S = 0.1

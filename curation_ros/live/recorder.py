@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from curation_ros.bags import open_bag
 from curation_ros.bags.qos import QosProfile
-from curation_ros.bags.reader import open_bag
 from curation_ros.bags.recovery import recover_bag
 from curation_ros.bags.writer import BagWriter
 from curation_ros.core.episode.gate import Closed, EpisodeGate

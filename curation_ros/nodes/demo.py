@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 from scipy.stats import fisher_exact
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.core.errors import CurationError
 from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 from curation_ros.dataset.manifests import save_selection
 from curation_ros.nodes.demo_events import (
     EVERYTHING,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
 
-from curation_ros.bags.reader import Bag, episode_event, find_bags, open_bag
+from curation_ros.bags import Bag, episode_event, open_bag
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.episode.status import (
     EpisodeEvent,
@@ -21,6 +21,7 @@ from curation_ros.core.episode.status import (
 from curation_ros.core.episode.stream import Sample, playback_order
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.types import NS_PER_S
+from curation_ros.dataset.episodes import claimed_id, find_bags
 from curation_ros.nodes.discovery import Discovery
 from curation_ros.nodes.messages import array_to_ros, message_type, status_from_ros
 from curation_ros.nodes.parameters import Parameter, declare
@@ -93,7 +94,7 @@ class Replay(WorkingNode):
             try:
                 bag = open_bag(path)
                 samples = bag.samples(self._map)
-                event = episode_event(bag, self._map, samples)
+                event = episode_event(bag, self._map, samples, claimed_id=claimed_id(path))
             except CurationError as err:
                 self.get_logger().error(str(err))
                 continue

@@ -16,11 +16,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.batch.workers import WorkerDiedError, check_workers, in_flight, spread
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError, PolicyError
 from curation_ros.core.types import Span
+from curation_ros.dataset.episodes import read_episode
 from curation_ros.files import append_line, named_errors, read_lines, try_lock
 from policy_node.policy import Policy
 from policy_node.rollouts import Rollout, rollout

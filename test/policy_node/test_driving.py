@@ -20,12 +20,12 @@ import pytest
 from graph import PATIENCE_S
 from pausing import PAUSE, RESUME, pausable
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.cli.main import main as curation
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 
 pytestmark = [pytest.mark.ros, pytest.mark.sim, pytest.mark.policy]
 pytest.importorskip("libero", reason="LIBERO is not installed")

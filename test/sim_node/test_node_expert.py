@@ -8,8 +8,9 @@ import pytest
 from commander import COMMANDS
 from robot import Robot
 
-from curation_ros.bags.reader import open_bag, read_episode
+from curation_ros.bags import open_bag
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 
 pytestmark = [pytest.mark.ros, pytest.mark.sim]
 pytest.importorskip("libero", reason="LIBERO is not installed")

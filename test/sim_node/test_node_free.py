@@ -11,7 +11,8 @@ from commander import COMMANDS, Commander
 from graph import MAPPED, DescribeParameters, PoseStamped, Trigger
 from robot import stamp_ns
 
-from curation_ros.bags.reader import open_bag, read_episode
+from curation_ros.bags import open_bag
+from curation_ros.dataset.episodes import read_episode
 
 pytestmark = [pytest.mark.ros, pytest.mark.sim]
 pytest.importorskip("libero", reason="LIBERO is not installed")

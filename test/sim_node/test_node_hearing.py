@@ -7,7 +7,7 @@ from commander import Commander
 from graph import LATCHED, MAPPED, DiagnosticArray, JointState, PoseStamped
 from robot import stamp_ns
 
-from curation_ros.bags.reader import read_episode
+from curation_ros.dataset.episodes import read_episode
 
 pytestmark = [pytest.mark.ros, pytest.mark.sim]
 pytest.importorskip("libero", reason="LIBERO is not installed")

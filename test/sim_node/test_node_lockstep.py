@@ -12,8 +12,8 @@ from commander import COMMANDS, Commander
 from graph import LATCHED, MAPPED, DiagnosticArray, PoseStamped, Trigger
 from robot import stamp_ns
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 
 pytestmark = [pytest.mark.ros, pytest.mark.sim]
 pytest.importorskip("libero", reason="LIBERO is not installed")

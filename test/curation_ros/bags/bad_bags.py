@@ -79,7 +79,9 @@ class Bench:
             "topic_map": json.dumps(topic_map().to_json()),
             **(custom_data or {}),
         }
-        writer = BagWriter(path, path.name, custom_data=data, compression=compression)
+        writer = bag_messages.make_writer(
+            path, path.name, custom_data=data, compression=compression
+        )
         for topic, kind in {**topic_map().topics, **(types or {})}.items():
             writer.add_topic(namespace + topic, kind)
         for k, s in enumerate(samples):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
+from mcap.writer import CompressionType
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
@@ -142,16 +144,32 @@ def to_plain(value: Any) -> Any:
     return value
 
 
+#: Compressions of chunks that other writers use.
+COMPRESSIONS = {
+    "zstd": CompressionType.ZSTD,
+    "lz4": CompressionType.LZ4,
+    "none": CompressionType.NONE,
+}
+
+
+def make_writer(
+    folder: Path, name: str, *, compression: str = "zstd", custom_data: Any = None
+) -> BagWriter:
+    """A writer whose chunks are compressed as asked for."""
+    with patch("curation_ros.bags.writer.COMPRESSION", COMPRESSIONS[compression]):
+        return BagWriter(folder, name, custom_data=custom_data)
+
+
 def write_bag(
     folder: Path,
     messages: list[tuple[str, int, Any]],
     *,
     custom_data: dict[str, str] | None = None,
     flush_every: int = 20,
-    **options: Any,
+    compression: str = "zstd",
 ) -> BagWriter:
     """Write (topic, stamp_ns, message) as the recorder does, and close the bag."""
-    writer = BagWriter(folder, folder.name, custom_data=custom_data, **options)
+    writer = make_writer(folder, folder.name, custom_data=custom_data, compression=compression)
     numbers: dict[str, itertools.count[int]] = {}
     for k, (topic, stamp_ns, message) in enumerate(messages):
         writer.add_topic(topic, message.__msgtype__, [QosProfile(depth=1000)])

@@ -16,8 +16,7 @@ from bad_bags import BAD, HUGE_BYTES, Bench, make_bad
 from episodes import make_reference
 from streams import record
 
-from curation_ros.bags import find_bags, read_episode
-from curation_ros.bags.mcap_file import TornFileError
+from curation_ros.bags.errors import TornFileError
 from curation_ros.bags.yaml_text import load_yaml
 from curation_ros.cli.main import main
 from curation_ros.core.decision.curation import Curation
@@ -26,6 +25,7 @@ from curation_ros.core.errors import BagError, ConfigError, CurationError, Episo
 from curation_ros.core.evidence.baseline import Baseline
 from curation_ros.core.evidence.checks import check_episode
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import find_bags, read_episode
 
 #: Of everything that reads one bad bag; a chunk of the largest size is not among them.
 MOST_MEMORY_BYTES = 150 << 20
@@ -183,7 +183,7 @@ import resource, sys
 limit = int(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 from pathlib import Path
-from curation_ros.bags import find_bags, read_episode
+from curation_ros.dataset.episodes import find_bags, read_episode
 from curation_ros.core.errors import CurationError
 for name in sys.argv[2:]:
     try:

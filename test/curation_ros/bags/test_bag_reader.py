@@ -21,6 +21,7 @@ from bag_messages import (
     TWIST,
     episode_messages,
     make,
+    make_writer,
     pose,
     status,
     to_cdr,
@@ -31,18 +32,12 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
-from curation_ros.bags import (
-    BagWriter,
-    find_bags,
-    message_schema,
-    open_bag,
-    read_episode,
-    recover_bag,
-)
-from curation_ros.bags.mcap_file import read_info
+from curation_ros.bags import BagWriter, message_schema, open_bag, recover_bag
+from curation_ros.bags.mcap_info import read_info
 from curation_ros.core.episode.builder import EpisodeBuilder
 from curation_ros.core.episode.topic_map import TopicMap, topic_map_from_json
 from curation_ros.core.errors import BagError, ConfigError
+from curation_ros.dataset.episodes import find_bags, read_episode
 
 POSE_TEXT = message_schema(POSE).text.encode()
 
@@ -342,7 +337,7 @@ def test_files_of_any_shape_are_read(tmp_path: Path, options: dict[str, Any]) ->
 
 
 def test_only_chunks_with_wanted_topics_are_unpacked(tmp_path: Path) -> None:
-    writer = BagWriter(tmp_path / "ep", "ep", compression="none")
+    writer = make_writer(tmp_path / "ep", "ep", compression="none")
     for topic, n in (("/big", 50), ("/eef_pose", 5)):
         writer.add_topic(topic, POSE)
         for k in range(n):

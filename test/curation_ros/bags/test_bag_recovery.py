@@ -82,14 +82,13 @@ def test_recovered_bag_keeps_everything_and_says_so(tmp_path: Path) -> None:
         )
     writer.flush()
     writer.abandon()
-    report = recover_bag(tmp_path / "p", tmp_path / "new", {"why": "test"})
+    report = recover_bag(tmp_path / "p", tmp_path / "new")
     bag = open_bag(tmp_path / "new")
     assert bag.mcap_paths[0].name == "name_0.mcap"
     assert [m.sequence for m in bag.messages()] == list(range(100, 120))
     assert [m.publish_time_ns for m in bag.messages()] == [START_NS + k for k in range(20)]
     assert bag.custom_data == {
         **custom,
-        "why": "test",
         "recovered": "true",
         "recovered_messages": "20",
         "recovered_tail": report.tail,

@@ -15,15 +15,10 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, IndexType, Writer
 
+from curation_ros.bags.errors import TornFileError
 from curation_ros.bags.mcap_blocks import read_blocks
-from curation_ros.bags.mcap_file import (
-    MAGIC,
-    McapInfo,
-    Message,
-    TornFileError,
-    read_info,
-    walk,
-)
+from curation_ros.bags.mcap_file import MAGIC, Message, walk
+from curation_ros.bags.mcap_info import McapInfo, read_info
 from curation_ros.core.errors import BagError
 
 N_CHANNELS = 3

@@ -9,8 +9,9 @@ import pytest
 from episodes import make_episode
 from streams import record
 
-from curation_ros.bags import find_bags, open_bag
+from curation_ros.bags import open_bag
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import find_bags
 
 DONE, USAGE, NOTHING = 0, 2, 3
 EARLY = ("pick-2", "pick-3")

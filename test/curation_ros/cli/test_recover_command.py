@@ -4,7 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from curation_ros.bags import find_bags, open_bag
+from curation_ros.bags import open_bag
+from curation_ros.dataset.episodes import find_bags
 
 Run = Callable[..., Any]
 

@@ -11,11 +11,12 @@ from typing import Any
 
 import pytest
 
-from curation_ros.bags import find_bags, open_bag, read_episode
+from curation_ros.bags import open_bag
 from curation_ros.configuration import read_curation, read_reference
 from curation_ros.core.episode.findings import FINDINGS
 from curation_ros.core.scorers import DEFAULT_SCORERS
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import find_bags, read_episode
 
 DONE, FOUND, USAGE, NOTHING = 0, 1, 2, 3
 KEYS = ["episode", "name", "path", "length", "scores", "decision", "reason", "span", "findings"]

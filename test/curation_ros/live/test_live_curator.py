@@ -15,7 +15,7 @@ import pytest
 from episodes import make_episode, make_reference, topic_map
 from streams import ended, feed, make_recording, record, samples_of, started
 
-from curation_ros.bags import CdrDecoder, read_episode
+from curation_ros.bags import CdrDecoder
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import CURATOR, Decision
 from curation_ros.core.episode.episode import Episode
@@ -23,6 +23,7 @@ from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.core.episode.stream import Sample
 from curation_ros.core.errors import CurationError, EpisodeError
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 from curation_ros.dataset.manifests import save_selection
 from curation_ros.live.curator import Decided, LiveCuration, log_decision, override
 

@@ -28,12 +28,13 @@ from streams import (
 )
 
 from curation_ros import __version__
-from curation_ros.bags import open_bag, read_episode, recover_bag
+from curation_ros.bags import open_bag, recover_bag
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.status import event_to_json
 from curation_ros.core.episode.stream import Sample
 from curation_ros.core.episode.topic_map import topic_map_from_json
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 from curation_ros.live.recorder import Notice, RecordedTopic, Recording, recover_partials
 
 STEP_NS = 50_000_000

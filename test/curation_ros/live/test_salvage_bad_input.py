@@ -16,7 +16,6 @@ from episodes import with_fields
 from scenes import without
 from streams import record, samples_of
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import Decision
 from curation_ros.core.decision.salvage import DEFAULT_MARGIN_S
@@ -24,6 +23,7 @@ from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import topic_map_from_json
 from curation_ros.core.types import Floats
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 
 SAMPLE = Path(__file__).resolve().parents[3] / "bags" / "sample"
 BOWL_TOPIC = "objects/akita_black_bowl_1/pose"

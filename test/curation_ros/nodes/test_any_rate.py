@@ -24,13 +24,14 @@ from graph import Graph, jsonl
 from naive_resampling import resample
 from robot import Robot
 
-from curation_ros.bags.reader import open_bag, read_episode
+from curation_ros.bags import open_bag
 from curation_ros.cli.main import main as curation
 from curation_ros.core.episode.identity import new_episode_id
 from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.core.episode.topic_map import topic_map_from_json
 from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 from curation_ros.nodes.messages import joints_to_ros, pose_to_ros, twist_to_ros
 
 std_msgs = pytest.importorskip("std_msgs.msg")

@@ -11,10 +11,11 @@ import yaml
 from graph import jsonl
 from robot import N_STEPS, PERIOD_NS, Robot, make_take, new_start_ns, other_robot_messages
 
-from curation_ros.bags.reader import open_bag, read_episode
+from curation_ros.bags import open_bag
 from curation_ros.cli.main import main as curation
 from curation_ros.core.episode.topic_map import topic_map_from_json
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 
 pytestmark = pytest.mark.ros
 

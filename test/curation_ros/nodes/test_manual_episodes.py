@@ -12,9 +12,10 @@ from pausing import pausable
 from robot import PERIOD_NS, Robot, libero_take, stamp_ns
 from std_srvs.srv import SetBool, Trigger
 
-from curation_ros.bags.reader import open_bag, read_episode
+from curation_ros.bags import open_bag
 from curation_ros.cli.main import main as curation
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 
 pytestmark = pytest.mark.ros
 

@@ -13,9 +13,11 @@ from robot import Robot, distinct, libero_take, plain, stamp_ns
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from curation_ros.bags.mcap_file import Message, TornFileError, walk
-from curation_ros.bags.reader import open_bag, read_episode
+from curation_ros.bags import open_bag
+from curation_ros.bags.errors import TornFileError
+from curation_ros.bags.mcap_file import Message, walk
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 
 pytestmark = pytest.mark.ros
 

@@ -12,7 +12,8 @@ from graph import MAPPED, QoSProfile, ReliabilityPolicy
 from pausing import pausable
 from robot import Robot, distinct, libero_take, without
 
-from curation_ros.bags.reader import open_bag, read_episode
+from curation_ros.bags import open_bag
+from curation_ros.dataset.episodes import read_episode
 
 pytestmark = pytest.mark.ros
 

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from curation_ros.bags.reader import open_bag, read_episode
+from curation_ros.bags import open_bag
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 
 pytestmark = pytest.mark.sim
 pytest.importorskip("libero", reason="LIBERO is not installed")

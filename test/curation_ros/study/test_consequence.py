@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.evidence.carrying import carrying_of
 from curation_ros.core.evidence.fingers import held_by_fingers
 from curation_ros.core.scorers import SCORERS
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.episodes import read_episode
 
 pytestmark = pytest.mark.sim
 pytest.importorskip("libero", reason="LIBERO is not installed")

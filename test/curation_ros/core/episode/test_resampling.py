@@ -15,12 +15,13 @@ from hypothesis import strategies as st
 from naive_resampling import Row, resample
 from streams import ended, samples_of
 
-from curation_ros.bags import CdrDecoder, open_bag, read_episode
+from curation_ros.bags import CdrDecoder, open_bag
 from curation_ros.core.episode.builder import EpisodeBuilder
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.stream import Sample
 from curation_ros.core.episode.topic_map import TopicMap, topic_map_from_json
 from curation_ros.core.types import NS_PER_S
+from curation_ros.dataset.episodes import read_episode
 
 START_NS = 1_781_000_000_000_000_000
 SAMPLE_BAG = Path(__file__).resolve().parents[4] / "bags" / "sample"

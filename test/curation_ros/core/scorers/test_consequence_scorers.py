@@ -9,13 +9,13 @@ import pytest
 from episodes import make_episode, make_reference, with_fields
 from scenes import LIFT, LIFT_AT, N_STEPS, RELEASE_AT, TRANSPORT, TRANSPORT_AT, scene, without
 
-from curation_ros.bags.reader import read_episode
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.scorers import SCORERS, Abstain, Look
 from curation_ros.core.scorers.grip_consistency import GripConsistency
 from curation_ros.core.scorers.object_coupling import ObjectCoupling
 from curation_ros.core.scorers.phase_events import PhaseEvents
+from curation_ros.dataset.episodes import read_episode
 
 NAMES = ("object_coupling", "grip_consistency", "phase_events")
 N_CARRY = LIFT + TRANSPORT
