@@ -31,6 +31,7 @@ import numpy as np
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.rules import RULES
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap, topic_map_from_json
 from curation_ros.core.evidence.alerts import AlertWatch
@@ -283,13 +284,13 @@ def decisions(folder: Path, seeds: tuple[int, ...], jobs: int) -> Iterator[dict[
     ][:_REFERENCES]
     given = [(read_episode(p), truth) for p, truth in collected(folder, seeds, jobs)]
     for name, shown in GRAPHS.items():
-        curation = Curation(scorers=(*RULES["evidence"].consults, "gripper_timing"))
-        curation.fit([shown(episode, rng) for episode, rng in trusted])
+        settings = CurationSettings(scorers=(*RULES["evidence"].consults, "gripper_timing"))
+        curation = Curation.fit(settings, [shown(episode, rng) for episode, rng in trusted])
         verdicts: dict[str, Counter[str]] = {kind: Counter() for kind in KINDS}
         decided_by: Counter[str] = Counter()
         late_steps: list[int] = []
         for episode, truth in given:
-            decision = curation.decide(shown(episode, _rng(truth)))
+            decision = curation.decide(curation.examine(shown(episode, _rng(truth))))
             kind = kind_of(truth)
             verdicts[kind][decision.verdict] += 1
             decided_by[str(decision.evidence.get("decided_by"))] += 1

@@ -29,7 +29,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from curation_ros.bags import BagWriter, open_bag
 from curation_ros.configuration import topic_map_or_default
-from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.fitted_scorers import fit_scorers
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.identity import new_episode_id
 from curation_ros.core.episode.status import EpisodeEvent, event_to_json
@@ -416,8 +417,8 @@ def measure_scores(folder: Path, fastest: str, pace: str, n_rounds: int) -> list
         bag = folder / f"{number:03d}-{pace}".replace(" ", "")
         events[bag / f"{bag.name}_0.mcap"] = write_episode(bag, topic_map, number, pace)
     paths = list(events)
-    curation = Curation(scorers=PAPER, rule="none", rule_scorer=PAPER[0])
-    curation.fit([read_episode(path.parent) for path in paths[:N_REFERENCES]])
+    settings = CurationSettings(scorers=PAPER, rule="none", rule_scorer=PAPER[0])
+    fitted = fit_scorers(settings, [read_episode(path.parent) for path in paths[:N_REFERENCES]])
     judged = paths[N_REFERENCES:]
     reader = READERS[fastest]()
 
@@ -429,18 +430,18 @@ def measure_scores(folder: Path, fastest: str, pace: str, n_rounds: int) -> list
 
     for path in judged:
         ours, other = by_us(path), by_other(path)
-        scores, abstained = curation.score(ours)
-        if ours.digest != other.digest or curation.score(other)[0] != scores or abstained:
+        scores, abstained = fitted.score(ours)
+        if ours.digest != other.digest or fitted.score(other)[0] != scores or abstained:
             raise SystemExit(f"{path}: {fastest} and we differ, or a scorer abstains: {abstained}")
     episodes = [by_us(path) for path in judged]
     turns = take_turns(
         {
-            "ours": lambda: [curation.score(by_us(path)) for path in judged],
-            "other": lambda: [curation.score(by_other(path)) for path in judged],
+            "ours": lambda: [fitted.score(by_us(path)) for path in judged],
+            "other": lambda: [fitted.score(by_other(path)) for path in judged],
             "reading, ours": lambda: [by_us(path) for path in judged],
             "reading, other": lambda: [by_other(path) for path in judged],
             # A copy: an episode remembers its state and action once they were asked for.
-            "scores alone": lambda: [curation.score(replace(episode)) for episode in episodes],
+            "scores alone": lambda: [fitted.score(replace(episode)) for episode in episodes],
         },
         n_rounds,
     )

@@ -58,9 +58,10 @@ def old_examine(tree: Path, reference: list[Episode]) -> Examine:
 
 def new_examine(tree: Path, reference: list[Episode]) -> Examine:
     """The examination as it is now."""
-    from curation_ros.configuration import read_curation
+    from curation_ros.configuration import read_settings
+    from curation_ros.core.decision.curation import Curation
 
-    return read_curation(tree / _CONFIG, {}).fit(reference).examine
+    return Curation.fit(read_settings(tree / _CONFIG, {}), reference).examine
 
 
 def references(sample: Episode, n: int) -> list[Episode]:

@@ -1,23 +1,22 @@
-"""Files that a person configures us by: the topic map, the curation, the reference."""
+"""Files that configure a run: the topic map, the settings of a curation, the reference."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.rules import RULES, Rule
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap, read_topic_map
 from curation_ros.core.errors import ConfigError
 from curation_ros.dataset.episodes import find_bags, read_episode
 
 _SOURCE = Path(__file__).resolve().parents[1]
-#: What YAML must hold for each keyword of Curation.
+#: What YAML must hold for each field of CurationSettings.
 _KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "scorers": (list, "a list"),
     "rule": (str, "a name"),
@@ -28,7 +27,6 @@ _KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "rule_params": (dict, "a mapping"),
     "salvage_margin_s": ((int, float, type(None)), "a number of seconds, or null"),
 }
-_DEFAULTS = inspect.signature(Curation).parameters
 
 
 def share_file(relative: str) -> Path:
@@ -37,8 +35,8 @@ def share_file(relative: str) -> Path:
     Raises:
         ConfigError: if it is in neither.
     """
-    # The prefix is some folders above <prefix>/lib/python3.x/site-packages, with pip and colcon
-    # alike. It need not be sys.prefix: a workspace of colcon lies over an environment.
+    # Both pip and colcon install into <prefix>/lib/python3.x/site-packages. The prefix need not be
+    # sys.prefix: a colcon workspace lies over an environment.
     share = Path("share") / "curation_ros" / relative
     for candidate in (_SOURCE / relative, *(folder / share for folder in _SOURCE.parents)):
         if candidate.is_file():
@@ -47,46 +45,46 @@ def share_file(relative: str) -> Path:
 
 
 def topic_map_or_default(path: str) -> TopicMap:
-    """The topic map of a file, or for an empty path that of the LIBERO robot.
+    """The topic map of a file, or that of the LIBERO robot for an empty path.
 
     Raises:
-        ConfigError: if the file is none.
+        ConfigError: if the file cannot be read, or is not a topic map.
     """
     return read_topic_map(Path(path) if path else share_file("config/topics.yaml"))
 
 
-def read_curation(config: Path | None, overrides: Mapping[str, Any]) -> Curation:
-    """Make an unfitted Curation from a YAML file and what a caller sets beside it.
+def read_settings(config: Path | None, overrides: Mapping[str, Any]) -> CurationSettings:
+    """Settings from a YAML file, and what a caller sets in addition.
 
     Args:
         config: `config/curation.yaml` or one like it; None takes the defaults.
-        overrides: keywords of Curation that win over the file; empty values do not. Scorers
+        overrides: fields of CurationSettings that win over the file; empty values do not. Scorers
             that decide are added to `scorers` that lack them.
 
     Raises:
         ConfigError: naming file and key.
     """
     where = f"curation config {config}"
-    settings = {} if config is None else _read_settings(config, where)
-    given = {k: v for k, v in overrides.items() if v}
+    settings = {} if config is None else _read_file(config, where)
+    given = {k: v for k, v in overrides.items() if v not in (None, "", (), [], {})}
     if given.get("rule", settings.get("rule")) != settings.get("rule"):
         settings.pop("rule_params", None)  # they are of the rule of the file
     settings.update(given)
     if "scorers" in given or "rule_scorer" in given:
-        names = list(settings.get("scorers", _DEFAULTS["scorers"].default))
+        defaults = CurationSettings()
+        names = list(settings.get("scorers", defaults.scorers))
         if settings.get("rule") == "none" and "rule_scorer" not in given:
             settings["rule_scorer"] = names[0]  # nothing decides
-        rule = RULES.get(settings.get("rule", _DEFAULTS["rule"].default), Rule)
-        decides = settings.get("rule_scorer", _DEFAULTS["rule_scorer"].default)
-        asked = [*rule.consults, decides]
-        settings["scorers"] = [*names, *(n for n in asked if n not in names)]
+        rule = RULES.get(settings.get("rule", defaults.rule), Rule)
+        needed = [*rule.consults, settings.get("rule_scorer", defaults.rule_scorer)]
+        settings["scorers"] = [*names, *(n for n in needed if n not in names)]
     try:
-        return Curation(**settings)
+        return CurationSettings(**settings)
     except ConfigError as err:
         raise ConfigError(f"{where}: {err}" if config and not given else str(err)) from err
 
 
-def _read_settings(config: Path, where: str) -> dict[str, Any]:
+def _read_file(config: Path, where: str) -> dict[str, Any]:
     try:
         raw = yaml.safe_load(config.read_text())
     except OSError as err:
@@ -96,8 +94,8 @@ def _read_settings(config: Path, where: str) -> dict[str, Any]:
     if not isinstance(raw, dict):
         raise ConfigError(f"{where}: expected a mapping, found {raw!r:.60}")
     for key, value in raw.items():
-        if key not in _DEFAULTS:
-            raise ConfigError(f"{where}: unknown key {key!r}; known are {', '.join(_DEFAULTS)}")
+        if key not in _KINDS:
+            raise ConfigError(f"{where}: unknown key {key!r}; known are {', '.join(_KINDS)}")
         kind, text = _KINDS[key]
         if not isinstance(value, kind) or isinstance(value, bool):
             raise ConfigError(f"{where}: {key!r} is {value!r:.60}, expected {text}")
@@ -106,7 +104,9 @@ def _read_settings(config: Path, where: str) -> dict[str, Any]:
             raise ConfigError(f"{where}: {key!r} is {raw[key]!r:.60}, expected names of scorers")
     for name, params in raw.get("scorer_params", {}).items():
         if not isinstance(params, dict):
-            raise ConfigError(f"{where}: parameters of {name!r} are {params!r:.60}: no mapping")
+            raise ConfigError(
+                f"{where}: parameters of {name!r} are {params!r:.60}: expected a mapping"
+            )
         if not all(isinstance(key, str) for key in params):
             raise ConfigError(
                 f"{where}: parameters of {name!r} are {params!r:.60}: expected names; "
@@ -120,7 +120,7 @@ def read_reference(paths: Sequence[Path], topic_map: TopicMap | None) -> list[Ep
 
     Args:
         paths: datasets or bags.
-        topic_map: the one that the episodes to judge are built by; None: that of each bag.
+        topic_map: the one that the scored episodes are built by; None: that of each bag.
 
     Raises:
         CurationError: if one cannot be read, or there is none.

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.fitted_scorers import FittedScorers, fit_scorers
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import ConfigError, EpisodeError
 from curation_ros.core.evidence.length_control import MODES, LengthControl
@@ -164,7 +165,7 @@ def audit(
         "length_control": {
             "mode": mode,
             "value": value,
-            "steps": controlled.length_.describe().get("steps"),
+            "steps": controlled.length.describe().get("steps"),
             "needs": _LENGTH_NEEDS.get(mode, "nothing"),
         },
         "length_separates": not identifiable,
@@ -176,7 +177,7 @@ def audit(
     table = _Table(settings, good, lengths, starts, identifiable)
     rows = []
     for name in _order(scores):
-        needs = "nothing" if name in _LENGTH_ROWS else controlled.scorers_[name].needs
+        needs = "nothing" if name in _LENGTH_ROWS else controlled.scorers[name].needs
         rows.append({"scorer": name, "needs": needs, **table.row(name, scores[name]), **facts})
     [left] = [row["auroc_controlled"] for row in rows if row["scorer"] == "length"]
     notes = _notes(facts, lengths, good, both, other, left)
@@ -240,8 +241,8 @@ def _fitted(
     control: LengthControl,
     trusted: Sequence[Episode],
     everything: Sequence[Episode],
-) -> Curation:
-    curation = Curation(
+) -> FittedScorers:
+    curation = CurationSettings(
         scorers=settings.scorers,
         rule="none",
         rule_scorer=settings.scorers[0] if settings.scorers else "",
@@ -249,7 +250,7 @@ def _fitted(
         length_value=control.value,
         scorer_params={k: v for k, v in settings.scorer_params.items() if k in settings.scorers},
     )
-    return curation.fit(trusted).fit_dataset(everything)
+    return fit_scorers(curation, trusted).fit_dataset(everything)
 
 
 @dataclass(frozen=True)
@@ -261,17 +262,19 @@ class _Scores:
     reasons: list[str]
 
 
-def _scores(judged: Sequence[Episode], raw: Curation, controlled: Curation) -> dict[str, _Scores]:
+def _scores(
+    judged: Sequence[Episode], raw: FittedScorers, controlled: FittedScorers
+) -> dict[str, _Scores]:
     """Every score of every episode, each computed once a length control."""
     found: dict[str, _Scores] = {
-        name: _Scores([], [], []) for name in (*_LENGTH_ROWS, *raw.scorers_)
+        name: _Scores([], [], []) for name in (*_LENGTH_ROWS, *raw.scorers)
     }
     for episode in judged:
         before, _ = raw.score(episode)
         after, why = controlled.score(episode)
         for name, scorer in _LENGTH_ROWS.items():
             before[name], _ = _score(scorer, episode, LengthControl("none"))
-            after[name], reason = _score(scorer, episode, controlled.length_)
+            after[name], reason = _score(scorer, episode, controlled.length)
             why.pop(name, None)
             if reason:
                 why[name] = reason

@@ -17,7 +17,9 @@ from curation_ros.batch.workers import WorkerDiedError, check_workers, spread
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import Decision, untrustworthy
 from curation_ros.core.decision.examination import Examination
-from curation_ros.core.decision.judgement import Ruling
+from curation_ros.core.decision.examining import examine
+from curation_ros.core.decision.fitted_rule import FittedRule
+from curation_ros.core.decision.fitted_scorers import FittedScorers
 from curation_ros.core.decision.ties import TieKey
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.findings import Finding
@@ -56,7 +58,7 @@ class Examiner:
 
     def __init__(
         self,
-        curation: Curation,
+        fitted: FittedScorers,
         topic_map: TopicMap | None = None,
         *,
         jobs: int = 1,
@@ -66,7 +68,7 @@ class Examiner:
         """Store how to work.
 
         Args:
-            curation: fitted.
+            fitted: the scorers to ask.
             topic_map: how episodes are built; None: by the map in each bag.
             jobs: workers; 1 works in this process, -1 takes all cores.
             backend: one of BACKENDS, where there are several workers.
@@ -76,7 +78,7 @@ class Examiner:
             ConfigError: for a backend that does not exist, or is not installed.
         """
         check_workers(jobs, backend)
-        self._task = _Task(curation, topic_map, _key(curation, topic_map))
+        self._task = _Task(fitted, topic_map, _key(fitted, topic_map))
         self._jobs = jobs
         self._backend = backend
         self._fresh = fresh
@@ -126,7 +128,7 @@ class Examiner:
 class _Task:
     """What a worker does with a batch of bags; goes to it as a whole."""
 
-    curation: Curation
+    fitted: FittedScorers
     topic_map: TopicMap | None
     key: str
 
@@ -147,8 +149,8 @@ class _Task:
                 results.append(Examined(bag, known[bag], is_known=True))
                 continue
             try:
-                seen = self.curation.examine(read_episode(bag, self.topic_map))
-                results.append(Examined(bag, seen, is_known=False))
+                found = examine(self.fitted, read_episode(bag, self.topic_map))
+                results.append(Examined(bag, found, is_known=False))
             except CurationError as err:
                 results.append(Examined(bag, err, is_known=False))
         return results, stamps
@@ -162,10 +164,10 @@ def _by_folder(bags: Iterable[Path]) -> list[list[Path]]:
     return list(grouped.values())
 
 
-def _key(curation: Curation, topic_map: TopicMap | None) -> str:
+def _key(fitted: FittedScorers, topic_map: TopicMap | None) -> str:
     """Under which an examination is kept: another version of ours may see other things."""
     by = "" if topic_map is None else f"+{topic_map.hash}"
-    return f"{__version__}+{curation.scoring_hash}{by}"
+    return f"{__version__}+{fitted.scoring_hash}{by}"
 
 
 def _stamp(bag: Path) -> str:
@@ -182,7 +184,7 @@ def _stamp(bag: Path) -> str:
 
 
 class EpisodesOf:
-    """The readable episodes of bags, read again each time: for `Curation.fit_dataset`."""
+    """The readable episodes of bags, read again each time: for `FittedScorers.fit_dataset`."""
 
     def __init__(self, bags: Sequence[Path], topic_map: TopicMap | None) -> None:
         """Name the bags."""
@@ -253,16 +255,16 @@ def judge_bags(
     Yields:
         What was seen of each bag, and the decision; None where it could not be read.
     """
-    ruling: Ruling | None = None
-    if curation.rule_looks_at_dataset:
+    rule: FittedRule | None = None
+    if curation.rule_needs_dataset:
         scores: dict[str, float | None] = {}
         copies = Copies()
         for one in progress(examiner.run(bags)):
             if isinstance(one.result, Examination):
                 seen = copies.note(one.result)
-                if curation.is_trusted(seen):
-                    scores[seen.episode] = seen.scores.get(curation.rule_scorer)
-        ruling = curation.ruling(scores, final=True, tie=tie)
+                if seen.is_trusted:
+                    scores[seen.episode] = seen.scores.get(curation.settings.rule_scorer)
+        rule = curation.rule_over(scores, final=True, tie=tie)
         results: Iterable[Examined] = examiner.run(bags)
     else:
         results = progress(examiner.run(bags))
@@ -270,6 +272,6 @@ def judge_bags(
     for one in results:
         if isinstance(one.result, Examination):
             seen = copies.note(one.result)
-            yield replace(one, result=seen), curation.judge(seen, ruling)
+            yield replace(one, result=seen), curation.decide(seen, rule)
         else:
             yield one, None

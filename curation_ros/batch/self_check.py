@@ -7,7 +7,6 @@ from scratch. If a single bit differs, something reads labels.
 
 from __future__ import annotations
 
-import copy
 import json
 import os
 import shutil
@@ -22,6 +21,7 @@ from curation_ros.configuration import read_reference
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import CURATOR, Decision, Verdict
 from curation_ros.core.decision.examination import Examination
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import CurationError
 from curation_ros.dataset.dataset import Dataset
@@ -82,7 +82,7 @@ class SelfCheck:
 
 def self_check(
     dataset: Dataset,
-    curation: Curation,
+    settings: CurationSettings,
     reference: Sequence[Path] = (),
     topic_map: TopicMap | None = None,
 ) -> SelfCheck:
@@ -90,7 +90,7 @@ def self_check(
 
     Args:
         dataset: nothing is written to it.
-        curation: configured; it is not changed.
+        settings: how to score and decide.
         reference: trusted demonstrations; the labels of those that are datasets are turned over,
             too.
         topic_map: how episodes are built; None: by the map in each bag.
@@ -107,7 +107,7 @@ def self_check(
                 f"dataset {dataset.path}: nothing to turn over: no label in truth.jsonl and "
                 "no decision of a person, here or in the reference"
             )
-        before, after = (_decide(c, copy.deepcopy(curation), topic_map) for c in (plain, other))
+        before, after = (_decide(c, settings, topic_map) for c in (plain, other))
     if not any(before.values()) and not any(after.values()):
         raise CurationError(f"dataset {dataset.path}: no episode that can be scored")
     differences = [
@@ -204,15 +204,15 @@ def _turned_decision(decision: Decision) -> Decision:
 
 
 def _decide(
-    copies: _Copies, curation: Curation, topic_map: TopicMap | None
+    copies: _Copies, settings: CurationSettings, topic_map: TopicMap | None
 ) -> dict[str, dict[str, Any] | None]:
     """All that is said about each bag, as plain data; None where it cannot be read."""
     bags = list(copies.dataset.bags())
     trusted = copies.reference
-    curation.fit(read_reference(trusted, topic_map) if trusted else [])
-    if curation.needs_dataset:
-        curation.fit_dataset(EpisodesOf(bags, topic_map))
-    examiner = Examiner(curation, topic_map, fresh=True)
+    curation = Curation.fit(settings, read_reference(trusted, topic_map) if trusted else [])
+    if curation.scorers.needs_dataset:
+        curation = curation.fit_dataset(EpisodesOf(bags, topic_map))
+    examiner = Examiner(curation.scorers, topic_map, fresh=True)
     said: dict[str, dict[str, Any] | None] = {}
     for one, decision in judge_bags(examiner, curation, bags, tie=copies.dataset.tie(0)):
         said[one.path.name] = None

@@ -13,7 +13,7 @@ from rich.table import Table
 from curation_ros.batch.audit import LENGTHS, Audit, AuditSettings, audit
 from curation_ros.cli.arguments import add_config, add_reference
 from curation_ros.cli.output import console, print_json, say, warn
-from curation_ros.configuration import read_curation, read_reference, share_file
+from curation_ros.configuration import read_reference, read_settings, share_file
 from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.scorers import SCORERS
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Audit and print."""
-    configured = read_curation(args.config or share_file("config/curation.yaml"), {})
+    configured = read_settings(args.config or share_file("config/curation.yaml"), {})
     length, value = _length(args.length)
     settings = AuditSettings(
         labels=args.labels,

@@ -17,11 +17,12 @@ from rich.text import Text
 from curation_ros.batch.examine import EpisodesOf, Examined, Examiner, judge_bags
 from curation_ros.cli.arguments import add_config, add_reference, add_rule, add_workers
 from curation_ros.cli.output import VERDICT_STYLE, console, print_json, progress_console, warn
-from curation_ros.configuration import read_curation, read_reference, share_file
+from curation_ros.configuration import read_reference, read_settings, share_file
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import CURATOR, VERDICTS, Decision, in_force
 from curation_ros.core.decision.examination import Examination
 from curation_ros.core.decision.rules import given_params
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.decision.ties import TieKey
 from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.errors import ConfigError, CurationError
@@ -65,10 +66,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Score everything that can be read; say what could not."""
-    curation = _curation(args)
+    settings = _settings(args)
     topic_map = read_topic_map(args.topic_map) if args.topic_map else None
     dataset = _dataset(args) if args.write else None
-    curation.fit(read_reference(args.reference, topic_map) if args.reference else [])
+    reference = read_reference(args.reference, topic_map) if args.reference else []
+    curation = Curation.fit(settings, reference)
     rows: list[dict[str, Any]] = []
     n_bad, n_twice = 0, 0
     n_known: Counter[bool] = Counter()
@@ -80,10 +82,10 @@ def run(args: argparse.Namespace) -> int:
     for path, problem in missing:
         n_bad += 1
         _report(args, path, problem)
-    if curation.needs_dataset:
-        curation.fit_dataset(EpisodesOf(bags, topic_map))
+    if curation.scorers.needs_dataset:
+        curation = curation.fit_dataset(EpisodesOf(bags, topic_map))
     examiner = Examiner(
-        curation, topic_map, jobs=args.jobs, backend=args.backend, fresh=args.fresh
+        curation.scorers, topic_map, jobs=args.jobs, backend=args.backend, fresh=args.fresh
     )
 
     def bar(results: Iterable[Examined]) -> Iterator[Examined]:
@@ -114,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
         elif person := _overruled_by(one.path, decision):
             overruled.append(f"{decision.name or decision.episode[:8]} ({person})")
         verdicts[decision.verdict] += 1
-        n_twice += decision.episode in curation.reference_ids_
+        n_twice += decision.episode in curation.scorers.reference_ids
         flawed = flawed or bool(decision.findings)
         row = decision_row(one.path, one.result, decision)
         if args.json:
@@ -186,7 +188,7 @@ def _overruled_by(path: Path, decision: Decision) -> str:
     return ""
 
 
-def _curation(args: argparse.Namespace) -> Curation:
+def _settings(args: argparse.Namespace) -> CurationSettings:
     config = args.config or share_file("config/curation.yaml")
     names = [n.strip() for n in args.scorers.split(",")] if args.scorers else None
     settings: dict[str, Any] = {
@@ -198,7 +200,7 @@ def _curation(args: argparse.Namespace) -> Curation:
         settings["rule_params"] = given_params(args.rule, args.value, args.method)
     elif args.value is not None or args.method:
         raise ConfigError("--value and --method belong to a --rule: name one")
-    return read_curation(config, settings)
+    return read_settings(config, settings)
 
 
 def _find(paths: list[Path]) -> tuple[list[Path], list[tuple[Path, CurationError]]]:
@@ -268,7 +270,7 @@ def _decided_by(decision: Decision) -> str:
 
 def _table(rows: list[dict[str, Any]], curation: Curation) -> Table:
     """All scores where the terminal is wide enough, else the one that decided."""
-    scorers = list(curation.scorers)
+    scorers = list(curation.scorers.scorers)
     is_wide = console.width >= _FIXED_WIDTH + _SCORE_WIDTH * len(scorers)
     if not is_wide:
         scorers = []

@@ -8,7 +8,7 @@ from pathlib import Path
 from curation_ros.batch.self_check import self_check
 from curation_ros.cli.arguments import add_config, add_reference
 from curation_ros.cli.output import print_json, say
-from curation_ros.configuration import read_curation, share_file
+from curation_ros.configuration import read_settings, share_file
 from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.scorers import scorer_names
 from curation_ros.dataset.dataset import Dataset
@@ -26,9 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Check, and say what was compared; 1 where something depends on labels."""
     config = args.config or share_file("config/curation.yaml")
-    curation = read_curation(config, {"scorers": scorer_names()})
+    settings = read_settings(config, {"scorers": scorer_names()})
     topic_map = read_topic_map(args.topic_map) if args.topic_map else None
-    done = self_check(Dataset(args.dataset), curation, args.reference, topic_map)
+    done = self_check(Dataset(args.dataset), settings, args.reference, topic_map)
     for difference in done.differences:
         if args.json:
             print_json(difference.to_json())

@@ -12,7 +12,7 @@ from curation_ros.batch.examine import EpisodesOf, Examiner, judge_bags, with_co
 from curation_ros.core.decision import decision as decisions
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import CURATOR, Decision, in_force
-from curation_ros.core.decision.judgement import Ruling
+from curation_ros.core.decision.fitted_rule import FittedRule
 from curation_ros.core.decision.salvage import LEAST_PREFIX_S
 from curation_ros.core.episode.builder import EpisodeBuilder
 from curation_ros.core.episode.episode import Episode
@@ -104,7 +104,7 @@ class LiveCuration:
             topic_map.topics, max_gap_s=topic_map.max_gap_s, drain_timeout_s=drain_timeout_s
         )
         self._decoder = decoder
-        self._scores = _known_scores(dataset, curation) if curation.rule_looks_at_dataset else {}
+        self._scores = _known_scores(dataset, curation) if curation.rule_needs_dataset else {}
         self._live: dict[str, _Live] = {}
         self._seen: dict[str, Episode] = {}
         self._read: deque[str] = deque(maxlen=_REMEMBERED)
@@ -123,7 +123,7 @@ class LiveCuration:
                 name=event.name,
                 start_ns=event.start_ns,
             )
-            watch = AlertWatch(self.topic_map, usual=self.curation.baseline_.usual_)
+            watch = AlertWatch(self.topic_map, usual=self.curation.scorers.baseline.usual_)
             self._live[event.id] = _Live(builder, event, watch)
             for sample in early:
                 builder.push(sample)
@@ -204,14 +204,14 @@ class LiveCuration:
         original = self.dataset.with_content(seen.content, other_than=seen.episode)
         if original is not None and seen.steps:
             seen = with_copy(seen, original)
-        ruling: Ruling | None = None
-        if self.curation.rule_looks_at_dataset:
-            if self.curation.is_trusted(seen):
-                self._scores[seen.episode] = seen.scores.get(self.curation.rule_scorer)
+        rule: FittedRule | None = None
+        if self.curation.rule_needs_dataset:
+            if seen.is_trusted:
+                self._scores[seen.episode] = seen.scores.get(self.curation.settings.rule_scorer)
             else:  # its bag may show a fault that was not seen live
                 self._scores.pop(seen.episode, None)
-            ruling = self.curation.ruling(self._scores, final=False, tie=self.dataset.tie(0))
-        return self.curation.judge(seen, ruling)
+            rule = self.curation.rule_over(self._scores, final=False, tie=self.dataset.tie(0))
+        return self.curation.decide(seen, rule)
 
     def bag_closed(self, episode_id: str) -> list[Decided]:
         """Compare a closed bag with what was seen live; where they differ, the bag wins.
@@ -259,9 +259,9 @@ class LiveCuration:
         """
         if own.evidence.get("content") != episode.content_digest:
             return False
-        if self.curation.rule_looks_at_dataset:
-            return bool(own.evidence.get("scoring") == self.curation.scoring_hash)
-        return own.state_hash == self.curation.state_hash
+        if self.curation.rule_needs_dataset:
+            return bool(own.evidence.get("scoring") == self.curation.scorers.scoring_hash)
+        return own.state_hash == self.curation.rule.state_hash
 
     def finish(self) -> list[Decision]:
         """Decide on the whole dataset, finally, where the rule depends on all of it.
@@ -272,11 +272,11 @@ class LiveCuration:
         Raises:
             CurationError: while an episode runs: its samples would be lost.
         """
-        if not self.curation.rule_looks_at_dataset:
+        if not self.curation.rule_needs_dataset:
             return []
         if self.running:
             raise EpisodeError("an episode is running: decide on the whole dataset after it")
-        decided = decide_dataset(self.dataset, self.curation, self.topic_map)
+        self.curation, decided = decide_dataset(self.dataset, self.curation, self.topic_map)
         # Scorers may have learned from the dataset anew: their scores of before count no more.
         self._scores = _known_scores(self.dataset, self.curation)
         return decided
@@ -293,7 +293,7 @@ class LiveCuration:
         Raises:
             EpisodeError: if the episode is not known or the verdict is none of the three.
         """
-        return override(self.dataset, prefix, verdict, reason, by, self.curation.state_hash)
+        return override(self.dataset, prefix, verdict, reason, by, self.curation.rule.state_hash)
 
     def _amend(self, decision: Decision, evidence: Mapping[str, Any]) -> None:
         merged = {**decision.evidence, **evidence}
@@ -303,7 +303,7 @@ class LiveCuration:
 
 def decide_dataset(
     dataset: Dataset, curation: Curation, topic_map: TopicMap | None = None
-) -> list[Decision]:
+) -> tuple[Curation, list[Decision]]:
     """Decide on every bag of a dataset, with all of them in view, and log what is new.
 
     Scorers that learn from the dataset learn from it anew; bags that cannot be read are left out.
@@ -314,20 +314,20 @@ def decide_dataset(
         topic_map: how episodes are built; None: by the map in each bag.
 
     Returns:
-        The decisions in force that were not logged before.
+        The curation, fitted on the dataset, and the decisions in force that are new.
     """
     bags = list(dataset.bags())
-    if curation.needs_dataset:
-        curation.fit_dataset(EpisodesOf(bags, topic_map))
+    if curation.scorers.needs_dataset:
+        curation = curation.fit_dataset(EpisodesOf(bags, topic_map))
     new = []
-    judged = judge_bags(Examiner(curation, topic_map), curation, bags, tie=dataset.tie(0))
+    judged = judge_bags(Examiner(curation.scorers, topic_map), curation, bags, tie=dataset.tie(0))
     for _, decision in judged:
         if decision is not None:
             known = len(dataset.decisions(decision.episode))
             logged = log_decision(dataset, decision)
             if len(dataset.decisions(decision.episode)) > known:
                 new.append(logged)
-    return new
+    return curation, new
 
 
 def _known_scores(dataset: Dataset, curation: Curation) -> dict[str, float | None]:
@@ -338,10 +338,10 @@ def _known_scores(dataset: Dataset, curation: Curation) -> dict[str, float | Non
         last = in_force(own).get(episode_id)
         if (
             last is not None
-            and last.evidence.get("scoring") == curation.scoring_hash
+            and last.evidence.get("scoring") == curation.scorers.scoring_hash
             and not decisions.untrustworthy(last.findings)
         ):
-            found[episode_id] = last.scores.get(curation.rule_scorer)
+            found[episode_id] = last.scores.get(curation.settings.rule_scorer)
     return found
 
 

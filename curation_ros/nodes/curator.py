@@ -14,11 +14,12 @@ from std_srvs.srv import Trigger
 
 from curation_ros.bags.cdr import CdrDecoder
 from curation_ros.configuration import (
-    read_curation,
     read_reference,
+    read_settings,
     share_file,
     topic_map_or_default,
 )
+from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import Decision
 from curation_ros.core.episode.status import (
     alert_to_status,
@@ -62,9 +63,9 @@ class Curator(WorkingNode):
         p = declare(self, PARAMETERS)
         topic_map = topic_map_or_default(p["topic_map"])
         config = Path(p["config"]) if p["config"] else share_file("config/curation.yaml")
-        curation = read_curation(config, {"scorers": p["scorers"], "rule": p["rule"]})
+        settings = read_settings(config, {"scorers": p["scorers"], "rule": p["rule"]})
         paths = [Path(path).expanduser() for path in p["reference"]]
-        curation.fit(read_reference(paths, topic_map) if paths else [])
+        curation = Curation.fit(settings, read_reference(paths, topic_map) if paths else [])
         dataset = Dataset(Path(p["dataset"]).expanduser(), create=True)
         self._live = LiveCuration(
             dataset, topic_map, CdrDecoder(), curation, drain_timeout_s=p["drain_timeout_s"]

@@ -56,13 +56,13 @@ def curate(episodes: Iterable[Episode], margins: Iterable[int] = ()) -> Curated:
         episodes: in any order.
         margins: control steps; beginnings are also made with each of these margins.
     """
-    curation = Curation().fit([])
+    curation = Curation.fit()
     decisions: dict[str, Decision] = {}
     prefixes: dict[int | None, dict[str, Span]] = {None: {}, **{m: {} for m in margins}}
     example: Episode | None = None
     for episode in episodes:
         examination = curation.examine(episode)
-        decision = decisions[episode.id] = curation.judge(examination)
+        decision = decisions[episode.id] = curation.decide(examination)
         broke = examination.breaks.get(str(decision.evidence.get("decided_by")))
         if decision.verdict == "salvage":
             prefixes[None][episode.id] = decision.span

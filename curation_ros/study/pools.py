@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from curation_ros.batch.audit import Audit, AuditSettings, audit
-from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.fitted_scorers import FittedScorers, fit_scorers
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import EpisodeError
 from curation_ros.core.types import Floats, JsonObject
@@ -83,7 +84,7 @@ def score_pool(name: str, dataset: Dataset, reference: Sequence[Episode], plan: 
         keep=min(plan.keep_for_audit, len(episodes)),
     )
     audited = audit(dataset, episodes, reference, settings)
-    curation = _fitted(plan, audited, reference, episodes)
+    fitted = _fitted(plan, audited, reference, episodes)
     terms = [term for term in plan.terms(name) if term.name in DECIDED]
     curated = None
     if terms:
@@ -94,15 +95,15 @@ def score_pool(name: str, dataset: Dataset, reference: Sequence[Episode], plan: 
         episodes=tuple(e.id for e in episodes),
         names={e.id: e.name for e in episodes},
         good=good,
-        scores=_scores(curation, episodes),
-        needs=_scorer_needs(curation, str(audited.facts["length_control"]["needs"])),
+        scores=_scores(fitted, episodes),
+        needs=_scorer_needs(fitted, str(audited.facts["length_control"]["needs"])),
         audited=list(audited.rows),
         notes=list(audited.notes),
         traces=[_trace(e, good[e.id]) for e in episodes],
         timelines={e.id: timeline_of(e) for e in episodes},
         curated=curated,
     )
-    pool.facts = _facts(pool, audited, curation.scoring_hash_)
+    pool.facts = _facts(pool, audited, fitted.scoring_hash)
     return pool
 
 
@@ -117,39 +118,39 @@ def _outcomes(name: str, dataset: Dataset, episodes: Sequence[Episode]) -> dict[
 
 def _fitted(
     plan: StudyPlan, audited: Audit, reference: Sequence[Episode], episodes: Sequence[Episode]
-) -> Curation:
+) -> FittedScorers:
     """The scorers of the plan, fitted with the length control of the audit."""
     control = audited.facts["length_control"]
     mode, value = control["mode"], control["value"]
     if mode == "percentile":  # the audit has taken it from the lengths in the pool
         mode, value = "fixed", control["steps"]
-    curation = Curation(
+    settings = CurationSettings(
         scorers=plan.scorers,
         rule="none",
         rule_scorer=plan.scorers[0],
         length=mode,
         length_value=value,
     )
-    return curation.fit(reference).fit_dataset(episodes)
+    return fit_scorers(settings, reference).fit_dataset(episodes)
 
 
-def _scores(curation: Curation, episodes: Iterable[Episode]) -> dict[str, dict[str, float]]:
+def _scores(fitted: FittedScorers, episodes: Iterable[Episode]) -> dict[str, dict[str, float]]:
     """Scorer -> id -> score, without abstentions."""
-    scores: dict[str, dict[str, float]] = {scorer: {} for scorer in curation.scorers_}
+    scores: dict[str, dict[str, float]] = {scorer: {} for scorer in fitted.scorers}
     for episode in episodes:
-        for scorer, score in curation.score(episode)[0].items():
+        for scorer, score in fitted.score(episode)[0].items():
             if score is not None:
                 scores[scorer][episode.id] = score
     return scores
 
 
-def _scorer_needs(curation: Curation, length_needs: str) -> dict[str, tuple[str, ...]]:
+def _scorer_needs(fitted: FittedScorers, length_needs: str) -> dict[str, tuple[str, ...]]:
     """Scorer -> what it needs; a length-controlled one also needs what the control needs."""
     return {
         name: sorted_needs(
             {scorer.needs, length_needs} if scorer.length_controlled else {scorer.needs}
         )
-        for name, scorer in curation.scorers_.items()
+        for name, scorer in fitted.scorers.items()
     }
 
 

@@ -10,13 +10,13 @@ import yaml
 from streams import record, same_arrays, short_episode
 
 from curation_ros.configuration import (
-    read_curation,
     read_reference,
+    read_settings,
     share_file,
     topic_map_or_default,
 )
-from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.rules import RULES
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.errors import BagError, ConfigError
 from curation_ros.core.scorers import DEFAULT_SCORERS
@@ -50,7 +50,7 @@ def test_topic_map_of_an_empty_path_is_that_of_the_libero_robot(tmp_path: Path) 
 
 
 def test_shipped_config_has_every_scorer_and_makes_a_curation() -> None:
-    curation = read_curation(share_file("config/curation.yaml"), {})
+    curation = read_settings(share_file("config/curation.yaml"), {})
     assert set(curation.scorers) == set(DEFAULT_SCORERS)
     assert curation.rule_scorer in curation.scorers
 
@@ -69,8 +69,8 @@ def test_every_key_of_the_file_is_used(tmp_path: Path) -> None:
         "rule_params": {"threshold": -1.5},
         "salvage_margin_s": 0.25,
     }
-    assert set(settings) == set(inspect.signature(Curation).parameters)
-    curation = read_curation(_write(tmp_path, settings), {})
+    assert set(settings) == set(inspect.signature(CurationSettings).parameters)
+    curation = read_settings(_write(tmp_path, settings), {})
     assert {key: getattr(curation, key) for key in settings} == {
         **settings,
         "scorers": ("knn", "smoothness"),
@@ -78,32 +78,38 @@ def test_every_key_of_the_file_is_used(tmp_path: Path) -> None:
 
 
 def test_no_file_takes_the_defaults() -> None:
-    assert vars(read_curation(None, {})) == vars(Curation())
-    assert vars(read_curation(None, {"scorers": None, "rule": ""})) == vars(Curation())
+    assert read_settings(None, {}) == CurationSettings()
+    assert read_settings(None, {"scorers": None, "rule": ""}) == CurationSettings()
 
 
 def test_override_wins_over_the_file_and_an_empty_one_does_not(tmp_path: Path) -> None:
     path = _write(tmp_path, {"scorers": ["gripper_timing", "length"], "rule": "threshold"})
-    curation = read_curation(path, {"scorers": (), "rule": "none"})
-    assert (curation.scorers, curation.rule) == (("gripper_timing", "length"), "none")
+    settings = read_settings(path, {"scorers": (), "rule": "none"})
+    assert (settings.scorers, settings.rule) == (("gripper_timing", "length"), "none")
+
+
+def test_zero_is_a_value(tmp_path: Path) -> None:
+    path = _write(tmp_path, {"salvage_margin_s": 0.5})
+    assert read_settings(path, {"salvage_margin_s": 0.0}).salvage_margin_s == 0.0
+    assert read_settings(path, {"salvage_margin_s": None}).salvage_margin_s == 0.5
 
 
 def test_scorer_that_decides_is_added_to_those_that_are_asked_for(tmp_path: Path) -> None:
     path = _write(tmp_path, {"rule": "threshold", "rule_scorer": "knn"})
-    assert read_curation(path, {"scorers": ["length"]}).scorers == ("length", "knn")
-    assert read_curation(path, {"scorers": ["knn", "length"]}).scorers == ("knn", "length")
+    assert read_settings(path, {"scorers": ["length"]}).scorers == ("length", "knn")
+    assert read_settings(path, {"scorers": ["knn", "length"]}).scorers == ("knn", "length")
     asked = RULES["evidence"].consults
     for scorers in (["length"], ["length", asked[0]]):
         expected = (*scorers, *(n for n in asked if n not in scorers), "gripper_timing")
-        assert read_curation(None, {"scorers": scorers}).scorers == expected
+        assert read_settings(None, {"scorers": scorers}).scorers == expected
     kept = _write(tmp_path, {"scorers": ["length", "gripper_timing"]})
-    assert read_curation(kept, {}).scorers == ("length", "gripper_timing")  # as it says
-    undecided = read_curation(path, {"scorers": ["length"], "rule": "none"})
+    assert read_settings(kept, {}).scorers == ("length", "gripper_timing")  # as it says
+    undecided = read_settings(path, {"scorers": ["length"], "rule": "none"})
     assert undecided.scorers == ("length",)
 
 
 def test_scorer_that_is_asked_to_decide_is_computed(tmp_path: Path) -> None:
-    curation = read_curation(None, {"rule_scorer": "knn_label_free"})
+    curation = read_settings(None, {"rule_scorer": "knn_label_free"})
     assert curation.rule_scorer == "knn_label_free"
     assert curation.scorers == (*DEFAULT_SCORERS, "knn_label_free")
 
@@ -111,9 +117,9 @@ def test_scorer_that_is_asked_to_decide_is_computed(tmp_path: Path) -> None:
 def test_parameters_of_the_file_s_rule_are_not_those_of_another(tmp_path: Path) -> None:
     config = tmp_path / "c.yaml"
     config.write_text("rule: threshold\nrule_params: {threshold: 0.5}\n")
-    assert read_curation(config, {}).rule_params == {"threshold": 0.5}
-    assert read_curation(config, {"rule": "threshold"}).rule_params == {"threshold": 0.5}
-    assert read_curation(config, {"rule": "gap"}).rule_params == {}
+    assert read_settings(config, {}).rule_params == {"threshold": 0.5}
+    assert read_settings(config, {"rule": "threshold"}).rule_params == {"threshold": 0.5}
+    assert read_settings(config, {"rule": "gap"}).rule_params == {}
 
 
 @pytest.mark.parametrize(
@@ -158,7 +164,7 @@ def test_config_that_makes_no_sense_is_refused_by_file(
 ) -> None:
     path = _write(tmp_path, settings)
     with pytest.raises(ConfigError, match=said) as refused:
-        read_curation(path, {})
+        read_settings(path, {})
     assert str(path) in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -166,13 +172,13 @@ def test_config_that_makes_no_sense_is_refused_by_file(
 def test_config_that_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
     for path in (tmp_path / "none.yaml", tmp_path):
         with pytest.raises(ConfigError, match=str(path)):
-            read_curation(path, {})
+            read_settings(path, {})
 
 
 def test_mistake_on_the_command_line_is_not_blamed_on_the_file(tmp_path: Path) -> None:
     path = _write(tmp_path, {"scorers": ["gripper_timing"]})
     with pytest.raises(ConfigError, match="no scorer 'nose'") as refused:
-        read_curation(path, {"scorers": ["nose"]})
+        read_settings(path, {"scorers": ["nose"]})
     assert str(path) not in str(refused.value)
 
 

@@ -1,4 +1,4 @@
-"""What was seen in an episode, before any rule: scores, findings, words. It can be kept."""
+"""What was found in an episode, before any rule: scores, findings, explanations."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from curation_ros.core.decision.decision import untrustworthy
+from curation_ros.core.decision.rules import Case
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.errors import EpisodeError
 from curation_ros.core.types import Span
@@ -19,15 +21,19 @@ class Part:
 
     Attributes:
         span: nanoseconds from the start stamp of the episode, inclusive.
-        without: what was left out, in words.
-        scores, abstained, words: as of an Examination, of this part alone.
+        without: what was left out, for people.
+        scores, abstained, explanations: as in Examination, of this part alone.
     """
 
     span: Span
     without: str
     scores: Scores
     abstained: Mapping[str, str] = field(default_factory=dict)
-    words: Mapping[str, str] = field(default_factory=dict)
+    explanations: Mapping[str, str] = field(default_factory=dict)
+
+    def case(self, episode: str) -> Case:
+        """What a rule decides on, if this part were all of the episode."""
+        return Case(episode, self.scores, self.abstained, self.explanations)
 
 
 @dataclass(frozen=True)
@@ -36,8 +42,8 @@ class Break:
 
     Attributes:
         at_ns: nanoseconds from the start stamp of the episode.
-        margin_s: what the good beginning keeps away from it.
-        span: of that beginning, nanoseconds from the start stamp, inclusive; None where nothing
+        margin_s: seconds that the good beginning ends before it.
+        span: of that beginning, nanoseconds from the start stamp, inclusive; None if nothing
             worth keeping is left.
     """
 
@@ -59,7 +65,9 @@ class Break:
 
 @dataclass(frozen=True)
 class Examination:
-    """Everything that a rule judges by: a function of the episode and of the fitted scorers.
+    """Everything that a rule decides on: a function of the episode and of the fitted scorers.
+
+    It does not depend on the rule, so it is computed once per episode and kept.
 
     Attributes:
         episode, name: identity of the episode.
@@ -67,12 +75,12 @@ class Examination:
         span: of the whole episode, nanoseconds from its start stamp, inclusive.
         scores: scorer -> score, None where it abstained.
         abstained: scorer -> why.
-        words: scorer -> what is to be seen in the episode, where it can say.
-        findings: faults of the recording, odd motion, failed task.
+        explanations: scorer -> one sentence for the operator, where it has one.
+        findings: faults of the recording, unusual motion, failed task.
         evidence: plain JSON values that go with the decision.
         content: digest of the values, the same for copies under other names.
-        part: what could be saved of a recording that is bad at an end.
-        breaks: scorer -> where it sees the episode break, for those that see that.
+        part: the sound part of a recording that is bad at an end.
+        breaks: scorer -> where it sees the episode break, for the scorers that see a break.
     """
 
     episode: str
@@ -81,15 +89,28 @@ class Examination:
     span: Span
     scores: Scores
     abstained: Mapping[str, str] = field(default_factory=dict)
-    words: Mapping[str, str] = field(default_factory=dict)
+    explanations: Mapping[str, str] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     evidence: Mapping[str, Any] = field(default_factory=dict)
     content: str = ""
     part: Part | None = None
     breaks: Mapping[str, Break] = field(default_factory=dict)
 
+    @property
+    def case(self) -> Case:
+        """What a rule decides on."""
+        return Case(self.episode, self.scores, self.abstained, self.explanations)
+
+    @property
+    def is_trusted(self) -> bool:
+        """Whether its recording has no fault that needs a person; a ranking takes no other."""
+        return not untrustworthy(self.findings)
+
     def to_json(self) -> dict[str, Any]:
-        """Plain data that `from_json` reads back to an equal examination."""
+        """Plain data that `from_json` reads back to an equal examination.
+
+        Explanations have the key `words`, as in examinations that were kept before.
+        """
         part = self.part
         return {
             "episode": self.episode,
@@ -98,7 +119,7 @@ class Examination:
             "span": list(self.span),
             "scores": dict(self.scores),
             "abstained": dict(self.abstained),
-            "words": dict(self.words),
+            "words": dict(self.explanations),
             "findings": [f.to_json() for f in self.findings],
             "evidence": dict(self.evidence),
             "content": self.content,
@@ -109,7 +130,7 @@ class Examination:
                 "without": part.without,
                 "scores": dict(part.scores),
                 "abstained": dict(part.abstained),
-                "words": dict(part.words),
+                "words": dict(part.explanations),
             },
             "breaks": {name: one.to_json() for name, one in self.breaks.items()},
         }
@@ -119,7 +140,7 @@ class Examination:
         """Read what `to_json` wrote.
 
         Raises:
-            EpisodeError: if it is none.
+            EpisodeError: if a key is missing or a value makes no sense.
         """
         try:
             part = raw["part"]
@@ -130,7 +151,7 @@ class Examination:
                 span=_span(raw["span"]),
                 scores=raw["scores"],
                 abstained=raw["abstained"],
-                words=raw["words"],
+                explanations=raw["words"],
                 findings=tuple(Finding.from_json(f) for f in raw["findings"]),
                 evidence=raw["evidence"],
                 content=raw["content"],
@@ -141,7 +162,7 @@ class Examination:
                     without=part["without"],
                     scores=part["scores"],
                     abstained=part["abstained"],
-                    words=part["words"],
+                    explanations=part["words"],
                 ),
                 breaks={name: Break.from_json(one) for name, one in raw["breaks"].items()},
             )

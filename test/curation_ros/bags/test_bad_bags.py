@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bad_bags import BAD, HUGE_BYTES, Bench, make_bad
+from decided import decide_on
 from episodes import make_reference
 from streams import record
 
@@ -20,6 +21,7 @@ from curation_ros.bags.errors import TornFileError
 from curation_ros.bags.yaml_text import load_yaml
 from curation_ros.cli.main import main
 from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.findings import FINDINGS
 from curation_ros.core.errors import BagError, ConfigError, CurationError, EpisodeError
 from curation_ros.core.evidence.baseline import Baseline
@@ -43,7 +45,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
 
 @pytest.fixture(scope="module")
 def curation() -> Curation:
-    return Curation(scorers=SCORERS).fit(_REFERENCE)
+    return Curation.fit(CurationSettings(scorers=SCORERS), _REFERENCE)
 
 
 def _skip_if_impossible(name: str, path: Path) -> None:
@@ -62,7 +64,7 @@ def _findings(path: Path, curation: Curation, known: set[str]) -> set[str]:
     if error is not None:
         assert str(error).isprintable()
         return {error.finding}
-    found = {f.id for f in curation.decide(episode).findings}
+    found = {f.id for f in decide_on(curation, episode).findings}
     found |= {f.id for f in check_episode(episode, _BASELINE)}
     return found | ({"duplicate"} if episode.content_digest in known else set())
 

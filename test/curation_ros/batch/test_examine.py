@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,8 @@ from streams import record
 from curation_ros.batch.examine import Copies, EpisodesOf, Examined, Examiner, judge_bags
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.examination import Examination
+from curation_ros.core.decision.fitted_scorers import FittedScorers, Looks
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.identity import new_episode_id
 from curation_ros.core.errors import BagError, ConfigError, CurationError
 from curation_ros.dataset.dataset import Dataset
@@ -31,7 +33,9 @@ N_BAGS = 40
 
 @pytest.fixture(scope="module")
 def fitted() -> Curation:
-    return Curation(scorers=SCORERS).fit(make_reference(np.random.default_rng(7)))
+    return Curation.fit(
+        CurationSettings(scorers=SCORERS), make_reference(np.random.default_rng(7))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -65,42 +69,48 @@ def texts(results: Iterator[Examined]) -> list[tuple[str, object]]:
 
 
 def test_second_run_reads_nothing_and_says_the_same(data: Path, fitted: Curation) -> None:
-    first = list(Examiner(fitted).run(bags_of(data)))
-    second = list(Examiner(fitted).run(bags_of(data)))
+    first = list(Examiner(fitted.scorers).run(bags_of(data)))
+    second = list(Examiner(fitted.scorers).run(bags_of(data)))
     assert [e.is_known for e in first] == [False] * N_BAGS
     assert [e.is_known for e in second] == [True] * N_BAGS
     assert [e.result for e in first] == [e.result for e in second]
 
 
 def test_only_what_is_new_or_has_changed_is_scored(data: Path, fitted: Curation) -> None:
-    list(Examiner(fitted).run(bags_of(data)))
+    list(Examiner(fitted.scorers).run(bags_of(data)))
     changed, *_ = bags_of(data)
     os.utime(next(changed.glob("*.mcap")), ns=(1, 1))
     added = record(Dataset(data), make_episode(np.random.default_rng(99), name="new"))
-    fresh = [e.path for e in Examiner(fitted).run(bags_of(data)) if not e.is_known]
+    fresh = [e.path for e in Examiner(fitted.scorers).run(bags_of(data)) if not e.is_known]
     assert sorted(fresh) == sorted([changed, added])
 
 
 def test_other_scorers_are_other_results(data: Path, fitted: Curation) -> None:
-    list(Examiner(fitted).run(bags_of(data)))
-    other = Curation(scorers=SCORERS).fit(make_reference(np.random.default_rng(8)))
-    assert not any(e.is_known for e in Examiner(other).run(bags_of(data)))
-    again = Curation(scorers=SCORERS, rule="none").fit(make_reference(np.random.default_rng(7)))
-    assert all(e.is_known for e in Examiner(again).run(bags_of(data)))  # a rule needs no reading
+    list(Examiner(fitted.scorers).run(bags_of(data)))
+    other = Curation.fit(
+        CurationSettings(scorers=SCORERS), make_reference(np.random.default_rng(8))
+    )
+    assert not any(e.is_known for e in Examiner(other.scorers).run(bags_of(data)))
+    again = Curation.fit(
+        CurationSettings(scorers=SCORERS, rule="none"), make_reference(np.random.default_rng(7))
+    )
+    assert all(
+        e.is_known for e in Examiner(again.scorers).run(bags_of(data))
+    )  # a rule needs no reading
 
 
 def test_fresh_examines_again_but_each_bag_once(data: Path, fitted: Curation) -> None:
-    list(Examiner(fitted).run(bags_of(data)))
-    examiner = Examiner(fitted, fresh=True)
+    list(Examiner(fitted.scorers).run(bags_of(data)))
+    examiner = Examiner(fitted.scorers, fresh=True)
     assert not any(e.is_known for e in examiner.run(bags_of(data)))
     assert all(e.is_known for e in examiner.run(bags_of(data)))
 
 
 def test_interrupted_run_goes_on_where_it_stopped(data: Path, fitted: Curation) -> None:
-    running = Examiner(fitted).run(bags_of(data))
+    running = Examiner(fitted.scorers).run(bags_of(data))
     seen = [next(running).path for _ in range(20)]
     running.close()
-    again = list(Examiner(fitted).run(bags_of(data)))
+    again = list(Examiner(fitted.scorers).run(bags_of(data)))
     known = [e.path for e in again if e.is_known]
     assert set(seen) <= set(known)
     assert len(known) < N_BAGS
@@ -127,9 +137,9 @@ def test_killed_run_goes_on_where_it_stopped(data: Path, fitted: Curation, tmp_p
 
 
 def test_rebuilding_the_index_forgets_what_was_examined(data: Path, fitted: Curation) -> None:
-    list(Examiner(fitted).run(bags_of(data)))
+    list(Examiner(fitted.scorers).run(bags_of(data)))
     assert Dataset(data).rebuild() == []
-    assert not any(e.is_known for e in Examiner(fitted).run(bags_of(data)))
+    assert not any(e.is_known for e in Examiner(fitted.scorers).run(bags_of(data)))
 
 
 def test_unreadable_bag_is_an_error_each_time_and_the_rest_is_scored(
@@ -138,7 +148,7 @@ def test_unreadable_bag_is_an_error_each_time_and_the_rest_is_scored(
     bad = bags_of(data)[5]
     next(bad.glob("*.mcap")).write_bytes(b"")
     for _ in range(2):
-        results = list(Examiner(fitted).run(bags_of(data)))
+        results = list(Examiner(fitted.scorers).run(bags_of(data)))
         wrong = [e for e in results if isinstance(e.result, CurationError)]
         assert [e.path for e in wrong] == [bad]
         assert isinstance(wrong[0].result, BagError)
@@ -153,18 +163,18 @@ def test_folder_that_is_no_dataset_stays_as_it_is(
     shutil.move(data / "episodes", folder)
     bags = sorted(p for p in folder.iterdir() if p.name[0] != ".")
     before = sorted(folder.rglob("*"))
-    assert not any(e.is_known for e in Examiner(fitted).run(bags))
-    assert all(e.is_known for e in Examiner(fitted).run(bags))
+    assert not any(e.is_known for e in Examiner(fitted.scorers).run(bags))
+    assert all(e.is_known for e in Examiner(fitted.scorers).run(bags))
     assert sorted(folder.rglob("*")) == before
 
 
 def test_index_that_cannot_be_written_costs_no_result(
     data: Path, fitted: Curation, tmp_path: Path
 ) -> None:
-    good = texts(Examiner(fitted).run(bags_of(data)))
+    good = texts(Examiner(fitted.scorers).run(bags_of(data)))
     Dataset(data).index.path.unlink()
     Dataset(data).index.path.mkdir()  # even root cannot open that as a database
-    examiner = Examiner(fitted)
+    examiner = Examiner(fitted.scorers)
     assert texts(examiner.run(bags_of(data))) == good
     assert "index" in examiner.problem
 
@@ -180,20 +190,20 @@ def test_workers_give_the_same_results_in_the_same_order(
         pytest.importorskip("ray", reason="the extra 'ray' is not installed")
     if backend == "dask":
         pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
-    alone = texts(Examiner(fitted).run(bags_of(data)))
+    alone = texts(Examiner(fitted.scorers).run(bags_of(data)))
     Dataset(data).index.path.unlink()
-    spread = Examiner(fitted, jobs=2, backend=backend)
+    spread = Examiner(fitted.scorers, jobs=2, backend=backend)
     assert texts(spread.run(bags_of(data))) == alone
-    assert all(e.is_known for e in Examiner(fitted).run(bags_of(data)))
+    assert all(e.is_known for e in Examiner(fitted.scorers).run(bags_of(data)))
 
 
 def test_worker_that_dies_is_told_in_one_line(data: Path, fitted: Curation) -> None:
-    class Deadly(Curation):
-        def examine(self, episode: object) -> Examination:
+    class Deadly(FittedScorers):
+        def look(self, episode: object) -> Looks:
             os.kill(os.getpid(), signal.SIGKILL)
             raise AssertionError
 
-    deadly = Deadly(scorers=SCORERS).fit(make_reference(np.random.default_rng(7)))
+    deadly = Deadly(**{f.name: getattr(fitted.scorers, f.name) for f in fields(FittedScorers)})
     with pytest.raises(CurationError, match="a worker died"):
         list(Examiner(deadly, jobs=2).run(bags_of(data)))
 
@@ -201,7 +211,7 @@ def test_worker_that_dies_is_told_in_one_line(data: Path, fitted: Curation) -> N
 @pytest.mark.parametrize("options", [{"backend": "slurm"}, {"jobs": 0}, {"jobs": -2}])
 def test_bad_options_are_refused(fitted: Curation, options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
-        Examiner(fitted, **options)  # type: ignore[arg-type]
+        Examiner(fitted.scorers, **options)  # type: ignore[arg-type]
 
 
 # --- copies and rules over the dataset ----------------------------------------------------------
@@ -211,7 +221,7 @@ def test_copy_of_an_episode_is_found_whatever_it_is_called(data: Path, fitted: C
     original = make_episode(np.random.default_rng(5), episode_id=new_episode_id(), name="first")
     record(Dataset(data), original)
     record(Dataset(data), replace(original, id=new_episode_id(), name="again"))
-    judged = list(judge_bags(Examiner(fitted), fitted, bags_of(data)))
+    judged = list(judge_bags(Examiner(fitted.scorers), fitted, bags_of(data)))
     copies = [d for _, d in judged if d and any(f.id == "duplicate" for f in d.findings)]
     assert [(d.name, d.verdict) for d in copies] == [("again", "review")]
     assert copies[0].reason == f"duplicate: same content as episode {original.id}"
@@ -231,8 +241,8 @@ def test_share_is_of_the_trusted_episodes_and_final(data: Path) -> None:
     broken = make_episode(np.random.default_rng(5), name="broken")
     shutil.copytree(record(Dataset(data), broken), data / "episodes" / new_episode_id())
     rule = {"rule": "top-fraction", "rule_scorer": "length", "rule_params": {"value": 0.5}}
-    curation = Curation(scorers=SCORERS, **rule).fit([])  # type: ignore[arg-type]
-    judged = [d for _, d in judge_bags(Examiner(curation), curation, bags_of(data)) if d]
+    curation = Curation.fit(CurationSettings(scorers=SCORERS, **rule))  # type: ignore[arg-type]
+    judged = [d for _, d in judge_bags(Examiner(curation.scorers), curation, bags_of(data)) if d]
     assert {d.evidence["basis"] for d in judged} == {"final"}
     assert {d.evidence["fitted_on"]["episodes"] for d in judged} == {N_BAGS + 1}
     assert len({d.evidence["fitted_on"]["hash"] for d in judged}) == 1
@@ -244,16 +254,18 @@ def test_share_is_of_the_trusted_episodes_and_final(data: Path) -> None:
 
 
 def test_twins_are_fitted_on_the_dataset_itself(data: Path) -> None:
-    curation = Curation(
-        scorers=("knn_label_free", "length"), rule="gap", rule_scorer="knn_label_free"
-    ).fit([])
-    assert curation.needs_dataset
-    seen = [e.result for e in Examiner(curation).run(bags_of(data))]
+    curation = Curation.fit(
+        CurationSettings(
+            scorers=("knn_label_free", "length"), rule="gap", rule_scorer="knn_label_free"
+        )
+    )
+    assert curation.scorers.needs_dataset
+    seen = [e.result for e in Examiner(curation.scorers).run(bags_of(data))]
     assert all(isinstance(e, Examination) and e.scores["knn_label_free"] is None for e in seen)
-    before = curation.scoring_hash
-    curation.fit_dataset(EpisodesOf(bags_of(data), None))
-    assert curation.scoring_hash != before
-    again = [e.result for e in Examiner(curation).run(bags_of(data))]
+    before = curation.scorers.scoring_hash
+    curation = curation.fit_dataset(EpisodesOf(bags_of(data), None))
+    assert curation.scorers.scoring_hash != before
+    again = [e.result for e in Examiner(curation.scorers).run(bags_of(data))]
     assert all(isinstance(e, Examination) and e.scores["knn_label_free"] for e in again)
 
 

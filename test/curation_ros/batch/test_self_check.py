@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from decided import decide_on
 from episodes import make_episode, make_reference
 from peeking import Peeker, bag_being_read
 from streams import record
 
 from curation_ros.batch.self_check import IDENTITY, self_check, turned
 from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import CurationError
 from curation_ros.core.scorers import SCORERS, Look
@@ -78,8 +80,8 @@ def cheat(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> st
     return "cheat"
 
 
-def _curation(*more: str, **options: Any) -> Curation:
-    return Curation(scorers=("gripper_timing", "knn", "length", *more), **options)
+def _settings(*more: str, **options: Any) -> CurationSettings:
+    return CurationSettings(scorers=("gripper_timing", "knn", "length", *more), **options)
 
 
 def _files(folder: Path) -> Iterator[tuple[str, bytes]]:
@@ -119,7 +121,7 @@ def test_scores_and_decisions_are_equal_to_the_last_bit(
     for episode in make_reference(rng, 4):
         record(reference, episode)
         reference.append_truth({"episode": episode.id, "outcome": "succeeded"})
-    done = self_check(told, Curation(scorers=tuple(SCORERS)), [reference.path])
+    done = self_check(told, CurationSettings(scorers=tuple(SCORERS)), [reference.path])
     assert done.differences == ()
     assert (done.episodes, done.unreadable, done.overrides) == (4, 0, 0)
     assert done.labels == 4 * (len(TRUTH) - len(IDENTITY) + 1) + 4
@@ -134,19 +136,19 @@ def test_rules_that_look_at_the_dataset_are_checked(
     told: Dataset, rule: str, value: float | None
 ) -> None:
     params = {} if value is None else {"value": value}
-    done = self_check(told, _curation(rule=rule, rule_params=params))
+    done = self_check(told, _settings(rule=rule, rule_params=params))
     assert (done.differences, done.episodes) == ((), 4)
 
 
 def test_nothing_is_written_to_the_dataset(told: Dataset, rng: np.random.Generator) -> None:
     before = dict(_files(told.path))
-    self_check(told, _curation())
+    self_check(told, _settings())
     assert dict(_files(told.path)) == before
 
 
 @pytest.mark.parametrize("cheat", [Peeker], indirect=True)
 def test_scorer_that_reads_the_truth_is_found(told: Dataset, cheat: str) -> None:
-    done = self_check(told, _curation(cheat))
+    done = self_check(told, _settings(cheat))
     scores = [d for d in done.differences if d.field == "score/cheat"]
     assert len(scores) == 4
     assert {(d.original, d.turned) for d in scores} == {("1.0", "0.0"), ("0.0", "1.0")}
@@ -158,7 +160,7 @@ def test_scorer_that_reads_the_truth_is_found(told: Dataset, cheat: str) -> None
 def test_verdict_that_rests_on_the_truth_is_found(told: Dataset, cheat: str) -> None:
     done = self_check(
         told,
-        _curation(cheat, rule="threshold", rule_scorer=cheat, rule_params={"threshold": 0.5}),
+        _settings(cheat, rule="threshold", rule_scorer=cheat, rule_params={"threshold": 0.5}),
     )
     fields = {d.field for d in done.differences}
     assert {"verdict", "reason", "score/cheat"} <= fields
@@ -166,17 +168,17 @@ def test_verdict_that_rests_on_the_truth_is_found(told: Dataset, cheat: str) -> 
 
 @pytest.mark.parametrize("cheat", [Resolver], indirect=True)
 def test_link_does_not_lead_back_to_the_labels_as_they_are(told: Dataset, cheat: str) -> None:
-    assert self_check(told, _curation(cheat)).differences
+    assert self_check(told, _settings(cheat)).differences
 
 
 @pytest.mark.parametrize("cheat", [Listener], indirect=True)
 def test_scorer_that_follows_people_is_found(told: Dataset, cheat: str) -> None:
-    fitted = _curation().fit([])
+    fitted = Curation.fit(_settings())
     for bag in told.bags():
         [name] = [n for i, n in told.names() if i == bag.name]
-        log_decision(told, fitted.decide(make_episode(episode_id=bag.name, name=name)))
+        log_decision(told, decide_on(fitted, make_episode(episode_id=bag.name, name=name)))
         override(told, bag.name, "keep", "fine", "Ada", "")
-    done = self_check(told, _curation(cheat))
+    done = self_check(told, _settings(cheat))
     assert done.overrides == 4
     assert {d.field for d in done.differences} >= {"score/cheat"}
 
@@ -186,18 +188,18 @@ def test_dataset_without_any_label_is_nothing_to_check(
 ) -> None:
     record(dataset, make_episode(rng))
     with pytest.raises(CurationError, match=r"no label in truth\.jsonl and no decision"):
-        self_check(dataset, _curation())
+        self_check(dataset, _settings())
 
 
 def test_dataset_without_an_episode_is_nothing_to_check(dataset: Dataset) -> None:
     dataset.append_truth({"episode": "gone", "outcome": "failed"})
     with pytest.raises(CurationError, match="no episode that can be scored"):
-        self_check(dataset, _curation())
+        self_check(dataset, _settings())
 
 
 def test_unreadable_bag_is_counted(told: Dataset) -> None:
     broken = told.bag_path("broken")
     broken.mkdir()
     (broken / "broken_0.mcap").write_bytes(b"")
-    done = self_check(told, _curation())
+    done = self_check(told, _settings())
     assert (done.unreadable, done.episodes, done.differences) == (1, 4, ())

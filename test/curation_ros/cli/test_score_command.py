@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from decided import decide_on
 
 from curation_ros.bags import open_bag
-from curation_ros.configuration import read_curation, read_reference
+from curation_ros.configuration import read_reference, read_settings
+from curation_ros.core.decision.curation import Curation
 from curation_ros.core.episode.findings import FINDINGS
 from curation_ros.core.scorers import DEFAULT_SCORERS
 from curation_ros.dataset.dataset import Dataset
@@ -67,11 +69,11 @@ def test_json_has_exactly_the_keys_and_types_of_the_contract(curation: Run, fold
 
 def test_json_is_what_the_library_says(curation: Run, folder: Path) -> None:
     told = curation("score", folder / "data", *_options(folder), "--json")
-    fitted = read_curation(folder / "curation.yaml", {})
-    fitted.fit(read_reference([folder / "reference"], None))
+    settings = read_settings(folder / "curation.yaml", {})
+    fitted = Curation.fit(settings, read_reference([folder / "reference"], None))
     for row in told.rows:
         episode = read_episode(Path(row["path"]))
-        decision = fitted.decide(episode)
+        decision = decide_on(fitted, episode)
         assert row["scores"] == dict(decision.scores)
         assert (row["decision"], row["reason"]) == (decision.verdict, decision.reason)
         assert row["span"] == list(decision.span)

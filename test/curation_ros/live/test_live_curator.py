@@ -12,12 +12,14 @@ from typing import Any
 import bag_messages
 import numpy as np
 import pytest
+from decided import decide_on
 from episodes import make_episode, make_reference, topic_map
 from streams import ended, feed, make_recording, record, samples_of, started
 
 from curation_ros.bags import CdrDecoder
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import CURATOR, Decision
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.core.episode.stream import Sample
@@ -34,7 +36,9 @@ SCORERS = ("gripper_timing", "smoothness", "knn", "length")
 
 @functools.cache
 def _fitted() -> Curation:
-    return Curation(scorers=SCORERS).fit(make_reference(np.random.default_rng(7)))
+    return Curation.fit(
+        CurationSettings(scorers=SCORERS), make_reference(np.random.default_rng(7))
+    )
 
 
 @functools.cache
@@ -92,7 +96,7 @@ def _told(decided: list[Decided]) -> Decision:
 
 
 def _offline(dataset: Dataset, episode: Episode) -> Decision:
-    return _fitted().decide(read_episode(dataset.bag_path(episode.id)))
+    return decide_on(_fitted(), read_episode(dataset.bag_path(episode.id)))
 
 
 def _stripped(decision: Decision) -> Decision:
@@ -175,7 +179,7 @@ def test_decision_is_on_disk_when_it_is_given(dataset: Dataset) -> None:
     [line] = dataset.decision_log(_good().id).read_text().splitlines()
     assert Decision.from_json(json.loads(line)) == decided.decision
     assert (decided.decision.revision, decided.decision.by) == (1, CURATOR)
-    assert decided.decision.state_hash == _fitted().state_hash
+    assert decided.decision.state_hash == _fitted().rule.state_hash
 
 
 def test_decision_comes_with_the_last_message_and_not_before(dataset: Dataset) -> None:
@@ -201,7 +205,7 @@ def test_samples_before_started_are_part_of_the_episode(dataset: Dataset) -> Non
 
 
 def test_without_a_reference_everything_is_for_review(dataset: Dataset) -> None:
-    live = _curator(dataset, Curation(scorers=SCORERS).fit([]))
+    live = _curator(dataset, Curation.fit(CurationSettings(scorers=SCORERS)))
     [decided] = _watch(live, _good(), _stream_of("good"))
     assert (decided.decision.verdict, decided.decision.reason) == ("review", "no reference")
     assert decided.decision.scores["knn"] is None
@@ -428,10 +432,12 @@ def test_replayed_episodes_may_lie_at_the_same_time(dataset: Dataset) -> None:
 
 def test_replay_under_another_state_is_a_new_revision(dataset: Dataset) -> None:
     _watch(_curator(dataset), _good(), _stream_of("good"))
-    other = Curation(scorers=SCORERS, length="none").fit(make_reference(np.random.default_rng(7)))
+    other = Curation.fit(
+        CurationSettings(scorers=SCORERS, length="none"), make_reference(np.random.default_rng(7))
+    )
     [second] = _watch(_curator(dataset, other), _good(), _stream_of("good"), source="replay")
     assert second.decision.revision == 2
-    assert second.decision.state_hash == other.state_hash != _fitted().state_hash
+    assert second.decision.state_hash == other.rule.state_hash != _fitted().rule.state_hash
 
 
 def test_empty_replay_is_answered(dataset: Dataset) -> None:
@@ -527,7 +533,7 @@ def test_override_of_what_two_episodes_are_called_is_refused(dataset: Dataset) -
 
 
 def test_repeated_decision_is_logged_once_and_its_evidence_is_added(dataset: Dataset) -> None:
-    decision = _fitted().decide(_good())
+    decision = decide_on(_fitted(), _good())
     log_decision(dataset, decision)
     log_decision(dataset, decision)
     assert len(dataset.decisions(_good().id)) == 1
@@ -539,7 +545,7 @@ def test_repeated_decision_is_logged_once_and_its_evidence_is_added(dataset: Dat
 
 
 def test_decision_that_several_make_at_once_is_logged_once(dataset: Dataset) -> None:
-    decision = _fitted().decide(_good())
+    decision = decide_on(_fitted(), _good())
     with ThreadPoolExecutor(8) as pool:
         told = list(pool.map(lambda _: log_decision(dataset, decision), range(16)))
     assert dataset.decisions(_good().id) == [decision]
@@ -547,7 +553,7 @@ def test_decision_that_several_make_at_once_is_logged_once(dataset: Dataset) -> 
 
 
 def test_evidence_added_after_a_person_decided_takes_nobodys_number(dataset: Dataset) -> None:
-    decision = _fitted().decide(_good())
+    decision = decide_on(_fitted(), _good())
     log_decision(dataset, decision)
     person = override(dataset, "good", "discard", "", "Ada", state_hash="")
     told = log_decision(dataset, replace(decision, evidence={"bag": "alone"}))
@@ -629,7 +635,9 @@ def test_removing_the_labels_changes_no_decision(dataset: Dataset) -> None:
 def _share(share: float = 0.5) -> Curation:
     options: dict[str, Any] = {"rule_scorer": "length", "rule_params": {"value": share}}
     reference = make_reference(np.random.default_rng(7))
-    return Curation(scorers=SCORERS, rule="top-fraction", **options).fit(reference)
+    return Curation.fit(
+        CurationSettings(scorers=SCORERS, rule="top-fraction", **options), reference
+    )
 
 
 def _episodes(n: int, first: int = 100) -> list[Episode]:
@@ -666,7 +674,9 @@ def test_curator_that_starts_again_goes_on_with_what_was_scored(dataset: Dataset
         _watch(_curator(dataset, _share()), episode, samples_of(episode))
     [decided] = _watch(_curator(dataset, _share()), episodes[4], samples_of(episodes[4]))
     assert decided.decision.evidence["fitted_on"]["episodes"] == 5
-    other = Curation(scorers=SCORERS, rule="top-fraction").fit([])  # has another hash
+    other = Curation.fit(
+        CurationSettings(scorers=SCORERS, rule="top-fraction")
+    )  # has another hash
     [decided] = _watch(_curator(dataset, other), episodes[0], samples_of(episodes[0]))
     assert decided.decision.evidence["fitted_on"]["episodes"] == 1
 
@@ -704,7 +714,9 @@ def test_episode_whose_bag_has_a_fault_counts_no_more(dataset: Dataset) -> None:
 
 def test_after_a_final_decision_the_next_episode_is_one_more(dataset: Dataset) -> None:
     options: dict[str, Any] = {"rule": "top-fraction", "rule_scorer": "knn_label_free"}
-    live = _curator(dataset, Curation(scorers=("knn_label_free", "length"), **options).fit([]))
+    live = _curator(
+        dataset, Curation.fit(CurationSettings(scorers=("knn_label_free", "length"), **options))
+    )
     *episodes, last = _episodes(7)
     for episode in episodes:
         [decided] = _watch(live, episode, samples_of(episode))

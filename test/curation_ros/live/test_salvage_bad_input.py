@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from decided import decide_on
 from episodes import with_fields
 from scenes import without
 from streams import record, samples_of
@@ -47,7 +48,7 @@ def early(good: Episode) -> Episode:
 
 @pytest.fixture(scope="module")
 def curation() -> Curation:
-    return Curation().fit([])
+    return Curation.fit()
 
 
 def _opened(episode: Episode, at: int) -> Episode:
@@ -122,7 +123,7 @@ def _cut_ns(opened_at: int) -> int:
 
 
 def test_poses_as_they_are_decide(good: Episode, early: Episode, curation: Curation) -> None:
-    kept, cut = curation.decide(good), curation.decide(early)
+    kept, cut = decide_on(curation, good), decide_on(curation, early)
     assert (kept.verdict, kept.evidence["decided_by"]) == ("keep", "object_coupling")
     assert (cut.verdict, cut.evidence["decided_by"]) == ("salvage", "object_coupling")
     assert cut.span == (0, _cut_ns(OPENED_AT))
@@ -133,7 +134,7 @@ def test_good_one_is_kept_by_gripper_and_phase_and_the_reason_says_both(
     good: Episode, curation: Curation, way: str
 ) -> None:
     spoil, why = SPOILT[way]
-    decision = curation.decide(spoil(good))
+    decision = decide_on(curation, spoil(good))
     assert decision.verdict == "keep"
     assert decision.reason.startswith(f"{HELD}; object_coupling cannot tell: {why}")
 
@@ -143,7 +144,7 @@ def test_early_one_is_cut_by_the_gripper_and_the_reason_says_both(
     early: Episode, curation: Curation, way: str
 ) -> None:
     spoil, why = SPOILT[way]
-    decision = curation.decide(spoil(early))
+    decision = decide_on(curation, spoil(early))
     assert decision.verdict == "salvage"
     assert decision.evidence["decided_by"] in ("grip_consistency", "phase_events")
     assert f"; object_coupling cannot tell: {why}" in decision.reason
@@ -155,7 +156,7 @@ def test_without_gripper_and_phase_a_person_is_asked(
     early: Episode, curation: Curation, way: str
 ) -> None:
     spoil, _ = SPOILT[way]
-    decision = curation.decide(without(spoil(early), "gripper", "phase"))
+    decision = decide_on(curation, without(spoil(early), "gripper", "phase"))
     assert decision.verdict == "review"
     assert decision.reason.startswith("object_coupling cannot tell: ")
     assert decision.reason.endswith("; no reference")
@@ -168,7 +169,7 @@ def test_object_that_nobody_publishes_is_for_review(good: Episode, curation: Cur
     other = BOWL_TOPIC.replace("bowl_1", "bowl_2")
     text = json.dumps(good.topic_map.to_json()).replace(BOWL_TOPIC, other)
     episode = read_episode(SAMPLE, topic_map_from_json(json.loads(text)))
-    decision = curation.decide(episode)
+    decision = decide_on(curation, episode)
     assert decision.verdict == "review"
     assert decision.reason == f"missing-topic: topic {other!r} has no sample in the episode"
     assert decision.abstained["object_coupling"].endswith("bowl_position has no pose")
@@ -178,14 +179,14 @@ def test_early_one_whose_object_nobody_published_is_not_cut(
     early: Episode, curation: Curation, dataset: Dataset
 ) -> None:
     others = [s for s in samples_of(early) if s.topic != BOWL_TOPIC]
-    decision = curation.decide(read_episode(record(dataset, early, samples=others)))
+    decision = decide_on(curation, read_episode(record(dataset, early, samples=others)))
     assert decision.verdict == "review"
     assert decision.reason.startswith(f"missing-topic: topic {BOWL_TOPIC!r} has no sample")
     assert "salvage" not in decision.evidence
 
 
 def test_episode_that_ends_in_mid_lift_is_for_review(good: Episode, curation: Curation) -> None:
-    decision = curation.decide(good.steps(SPOILT_AT))
+    decision = decide_on(curation, good.steps(SPOILT_AT))
     assert decision.verdict == "review"
     assert decision.reason.endswith("; no reference")
     for said in (
@@ -199,7 +200,7 @@ def test_episode_that_ends_in_mid_lift_is_for_review(good: Episode, curation: Cu
 def test_what_broke_before_an_episode_ends_in_mid_lift_is_known(
     early: Episode, curation: Curation
 ) -> None:
-    decision = curation.decide(early.steps(OPENED_AT + 5))
+    decision = decide_on(curation, early.steps(OPENED_AT + 5))
     assert (decision.verdict, decision.span) == ("salvage", (0, _cut_ns(OPENED_AT)))
     assert decision.evidence["decided_by"] == "object_coupling"
 
@@ -248,14 +249,14 @@ def _second(episode: Episode, at: int) -> int:
 
 
 def test_two_objects_carried_in_turn_are_kept(good: Episode, curation: Curation) -> None:
-    decision = curation.decide(_in_turn(good, good))
+    decision = decide_on(curation, _in_turn(good, good))
     assert (decision.verdict, decision.evidence["decided_by"]) == ("keep", "object_coupling")
 
 
 def test_first_of_two_that_is_lost_ends_what_is_kept(
     good: Episode, early: Episode, curation: Curation
 ) -> None:
-    decision = curation.decide(_in_turn(early, good))
+    decision = decide_on(curation, _in_turn(early, good))
     assert decision.reason.startswith("bowl_position left the effector")
     assert (decision.verdict, decision.span) == ("salvage", (0, _cut_ns(OPENED_AT)))
 
@@ -263,7 +264,7 @@ def test_first_of_two_that_is_lost_ends_what_is_kept(
 def test_second_of_two_that_is_lost_leaves_the_first(
     good: Episode, early: Episode, curation: Curation
 ) -> None:
-    decision = curation.decide(_in_turn(good, early))
+    decision = decide_on(curation, _in_turn(good, early))
     assert decision.reason.startswith("plate_position left the effector")
     opened_at = _second(good, OPENED_AT)
     assert (decision.verdict, decision.span) == ("salvage", (0, _cut_ns(opened_at)))
@@ -276,7 +277,7 @@ def test_second_of_two_whose_pose_freezes_is_judged_by_the_gripper(
     plate = both.fields["plate_position"].copy()
     at = _second(good, SPOILT_AT)
     plate[at:] = plate[at - 1]
-    decision = curation.decide(with_fields(both, plate_position=plate))
+    decision = decide_on(curation, with_fields(both, plate_position=plate))
     assert decision.evidence["decided_by"] in ("grip_consistency", "phase_events")
     assert "object_coupling cannot tell: no new pose of plate_position" in decision.reason
     assert decision.verdict == "salvage"
@@ -291,7 +292,7 @@ def test_good_one_is_never_cut_wherever_its_poses_go_wrong(
     good: Episode, curation: Curation, at: int
 ) -> None:
     for way, (spoil, _) in SPOILT.items():
-        decision: Decision = curation.decide(spoil(good, at))
+        decision: Decision = decide_on(curation, spoil(good, at))
         assert decision.verdict != "salvage", (way, decision.reason)
 
 
@@ -300,7 +301,7 @@ def test_early_one_is_never_cut_but_by_its_command_to_open(
     early: Episode, curation: Curation, at: int
 ) -> None:
     for way, (spoil, _) in SPOILT.items():
-        decision = curation.decide(spoil(early, at))
+        decision = decide_on(curation, spoil(early, at))
         assert decision.verdict != "keep", (way, decision.reason)
         if decision.verdict == "salvage":
             assert decision.span == (0, _cut_ns(OPENED_AT)), (way, decision.reason)

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from decided import decide_on
 from episodes import make_episode
 from streams import record
 
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import Decision
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.status import EpisodeEvent, Status
 from curation_ros.core.errors import CurationError
 from curation_ros.dataset.dataset import Dataset
@@ -26,16 +28,18 @@ DROPS_AT = 140
 def _demonstrated(path: Path, *open_at: int, salvage: bool = True) -> dict[str, Decision]:
     """Bags and decisions of episodes that open the gripper at these steps; decisions by name."""
     rng = np.random.default_rng(5)
-    curation = Curation(
-        scorers=["object_coupling", "grip_consistency", "phase_events", "gripper_timing"],
-        salvage_margin_s=0.75 if salvage else None,
-    ).fit([])
+    curation = Curation.fit(
+        CurationSettings(
+            scorers=["object_coupling", "grip_consistency", "phase_events", "gripper_timing"],
+            salvage_margin_s=0.75 if salvage else None,
+        )
+    )
     dataset = Dataset(path, create=True)
     decisions = {}
     for k, step in enumerate(open_at):
         episode = make_episode(rng, name=f"demo-{k}", open_at=step)
         record(dataset, episode)
-        decisions[episode.name] = curation.decide(episode)
+        decisions[episode.name] = decide_on(curation, episode)
         dataset.append_decision(decisions[episode.name])
     return decisions
 

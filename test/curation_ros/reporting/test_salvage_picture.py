@@ -13,6 +13,7 @@ from episodes import make_episode
 
 pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
+from decided import decide_on
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
@@ -35,7 +36,7 @@ def dropped() -> Episode:
 
 @pytest.fixture(scope="module")
 def decision(dropped: Episode) -> Decision:
-    found = Curation().fit([]).decide(dropped)
+    found = decide_on(Curation.fit(), dropped)
     assert found.verdict == "salvage"
     return found
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from decided import decide_on
 from episodes import make_episode, make_reference, with_fields
 
 from curation_ros.core.decision.curation import Curation
@@ -52,12 +53,12 @@ def test_padding_is_what_the_finding_says() -> None:
 def test_curation_salvages_the_sound_part_of_a_good_demonstration(
     rng: np.random.Generator,
 ) -> None:
-    curation = Curation().fit(make_reference(rng))
+    curation = Curation.fit(reference=make_reference(rng))
     episode = make_episode(rng, 250, task_steps=240)
     eef = episode.field("eef_position").copy()
     eef[245:] = np.nan
     fault = Finding("not-finite", "5 samples", (1, 1))
     bad = replace(with_fields(episode, eef_position=eef), findings=(fault,))
-    decision = curation.decide(bad)
+    decision = decide_on(curation, bad)
     assert (decision.verdict, decision.span) == ("salvage", bad.span(0, 244)), decision.reason
     assert "without not-finite" in decision.reason

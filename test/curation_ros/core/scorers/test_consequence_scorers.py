@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from decided import decide_on
 from episodes import make_episode, make_reference, with_fields
 from scenes import LIFT, LIFT_AT, N_STEPS, RELEASE_AT, TRANSPORT, TRANSPORT_AT, scene, without
 
 from curation_ros.core.decision.curation import Curation
+from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.scorers import SCORERS, Abstain, Look
 from curation_ros.core.scorers.grip_consistency import GripConsistency
@@ -50,7 +52,7 @@ def test_what_follows_the_release_changes_no_score(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_length_control_changes_no_score(name: str) -> None:
     how = {"rule": "none", "rule_scorer": name, "length": "fixed", "length_value": 60}
-    curation = Curation(scorers=(name,), **how).fit([])  # type: ignore[arg-type]
+    curation = Curation.fit(CurationSettings(scorers=(name,), **how))  # type: ignore[arg-type]
     for episode in (scene(), scene(opened_at=LIFT_AT + 20)):
         assert curation.examine(episode).scores[name] == SCORERS[name]().score(episode)
 
@@ -177,11 +179,11 @@ def test_parameters_that_make_no_sense_are_refused() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_rule_fitted_on_carries_keeps_them_and_discards_drops(name: str) -> None:
     rng = np.random.default_rng(2)
-    curation = Curation(scorers=(name,), rule="threshold", rule_scorer=name).fit(
-        make_reference(rng)
+    curation = Curation.fit(
+        CurationSettings(scorers=(name,), rule="threshold", rule_scorer=name), make_reference(rng)
     )
-    assert curation.decide(make_episode(rng)).verdict == "keep"
-    dropped = curation.decide(make_episode(rng, open_at=140))
+    assert decide_on(curation, make_episode(rng)).verdict == "keep"
+    dropped = decide_on(curation, make_episode(rng, open_at=140))
     assert dropped.verdict == "discard"
     assert "at 7." in dropped.reason  # where, in words
     assert "in LIFT" in dropped.reason or "of LIFT" in dropped.reason
