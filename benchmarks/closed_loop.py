@@ -36,8 +36,10 @@ from curation_ros.core.episode.phases import PHASES
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.episodes import read_episode
 from curation_ros.study.collect import Collection, collect
+from curation_ros.study.units import named_variant
 from policy_node.policy import Policy
 from policy_node.rollouts import SimController, rollout
+from policy_node.settings import TrainingSettings
 from policy_node.train import train
 from sim_node.defects import DEFECTS, Defect
 from sim_node.env import BOWL, LiberoEnv
@@ -70,9 +72,8 @@ _DEMONSTRATIONS = Collection(
     seed=_SEED_DEMONSTRATIONS,
     max_steps_defective=300,
 )
-_TRAINING_STEPS = 3000
-_JITTER_M = 0.004
-"""As few demonstrations need it, see `policy_node.train.train`."""
+#: With the noise that few demonstrations need.
+_SETTINGS = TrainingSettings(steps=3000, start_jitter_m=0.004)
 
 Floats = NDArray[np.float64]
 
@@ -120,7 +121,7 @@ def policies(dataset: Dataset) -> tuple[Policy, Policy]:
     clean = [e for e in everything if truth[e.id]["defect"] == "none"]
     first, second = (
         train(
-            [(e, None) for e in kept], seed=0, steps=_TRAINING_STEPS, start_jitter_m=_JITTER_M
+            [(e, None) for e in kept], named_variant("relative"), seed=0, settings=_SETTINGS
         ).policy
         for kept in (clean, everything)
     )

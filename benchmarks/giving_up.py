@@ -20,9 +20,10 @@ from curation_ros.core.statistics.intervals import clopper_pearson
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.episodes import read_episode
 from curation_ros.study.collect import Collection, collect
-from policy_node.batch_training import FailedTraining, TrainingJob, train_many
-from policy_node.policy import Policy
+from curation_ros.study.units import named_variant
+from policy_node.policy import load_policy
 from policy_node.rollouts import GiveUp, SimController
+from policy_node.train_many import FailedTraining, TrainingJob, train_many
 from sim_node.env import process_env
 from sim_node.environment import Command
 from sim_node.episodes import EpisodeLimits, run_episode
@@ -42,7 +43,8 @@ def train(data: Path, out: Path, good: int, bad: int, variant: str) -> Path:
     chosen = [bag for bag in bags if truth[bag.name]["defect"] == "none"][:good]
     chosen += [bag for bag in bags if truth[bag.name]["defect"] != "none"][:bad]
     key = f"{good}-{bad}-{variant}"
-    job = TrainingJob(key, [(read_episode(bag), None) for bag in chosen], 0, variant)
+    episodes = [(read_episode(bag), None) for bag in chosen]
+    job = TrainingJob(key, episodes, named_variant(variant), seed=0)
     [made] = train_many([job])
     if isinstance(made, FailedTraining):
         raise SystemExit(made.reason)
@@ -60,7 +62,7 @@ def watch(policy: Path, start: str) -> dict[str, Any]:
         if why and not said:
             said.append((step.index, why))
 
-    controller = SimController(Policy.load(policy))
+    controller = SimController(load_policy(policy))
     ended = run_episode(
         process_env(),
         start_by_name(start),

@@ -15,6 +15,8 @@ from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.manifests import read_selected, save_selection
 from curation_ros.nodes.evaluate import evaluate_on_graph
 from curation_ros.nodes.processes import Domain, Nodes
+from curation_ros.study.units import named_variant
+from policy_node.settings import TrainingSettings
 from policy_node.train import train
 
 COMMAND = "python benchmarks/run.py graph_speed"
@@ -46,11 +48,13 @@ def expert_rate(folder: Path, dataset: Dataset) -> float:
 def policy_rate(folder: Path, dataset: Dataset) -> float:
     """Steps per second of a policy in lockstep; the first rollout is left out."""
     manifest, _ = save_selection(dataset, rule="all", name="all")
-    policy = train(read_selected(manifest, dataset), seed=0, steps=500).policy
+    demonstrations = read_selected(manifest, dataset)
+    settings = TrainingSettings(steps=500)
+    policy = train(demonstrations, named_variant("relative"), seed=0, settings=settings).policy
     policy.save(folder / "policy")
     ends_s, steps = [], 0
     for rollout in evaluate_on_graph(
-        folder / "policy", policy.id, "generated:3:5", log_folder=folder / "logs"
+        folder / "policy", policy.card.id, "generated:3:5", log_folder=folder / "logs"
     ):
         ends_s.append(time.monotonic())
         steps += rollout["steps"] if len(ends_s) > 1 else 0

@@ -64,13 +64,18 @@ _BACK = {"command/twist": TwistStamped, "command/gripper": JointState}
 
 def run() -> list[dict[str, Any]]:
     """Measure; a row a figure."""
+    from curation_ros.study.units import named_variant
+    from policy_node.settings import TrainingSettings
     from policy_node.train import train
 
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         reference = record(folder / "reference", episodes=6, seed=101)
         manifest, _ = save_selection(Dataset(reference), rule="all", name="all")
-        policy = train(read_selected(manifest, Dataset(reference)), seed=0, steps=500).policy
+        demonstrations = read_selected(manifest, Dataset(reference))
+        settings = TrainingSettings(steps=500)
+        trained = train(demonstrations, named_variant("relative"), seed=0, settings=settings)
+        policy = trained.policy
         policy.save(folder / "policy")
         graph, alone, bare = _rounds(folder, policy)
     figures = {

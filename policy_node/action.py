@@ -2,39 +2,206 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.episode.topic_map import TopicMap
+from curation_ros.core.episode.topic_map import FieldSpec, TopicMap
 from curation_ros.core.errors import CurationError, PolicyError
-from curation_ros.core.evidence.gripper import is_closed_command, is_open_command
+from curation_ros.core.evidence.gripper import commanded
 from curation_ros.core.types import Floats, Span
 
-TWIST = "twist"
-GRIPPER_OPEN, GRIPPER_CLOSED = -1.0, 1.0
-N_OUTPUTS = 4
+_ROLES = ("action", "gripper")
+#: Rounding in scaling is no clipping.
+_ROUNDING = 1e-9
+#: An output within [-1, 1] is multiplied by the scale, so that a scale has to be a number.
+_NO_MOTION = 1.0
+
+
+@dataclass(frozen=True)
+class CommandTerm:
+    """A command field as a variant names it.
+
+    Attributes:
+        field: name in the topic map.
+        scale: command, from the center, that is an output of 1: one number per value of the
+            field, or one for all. Empty: the largest command of the demonstrations, per value.
+        center: command that is an output of 0, in the same form. Empty: the middle of the
+            demonstrations, per value.
+    """
+
+    field: str
+    scale: tuple[float, ...] = ()
+    center: tuple[float, ...] = (0.0,)
+
+
+@dataclass(frozen=True)
+class ScaledCommand:
+    """A command field of numbers: its values are `center + scale * output`.
+
+    Attributes:
+        name: field of the topic map.
+        unit: of its values.
+        scale: (D,) in the unit; demonstrations move slower than they may, and targets that fill
+            [-1, 1] are learned far better than small ones. Commands beyond it are clipped, so the
+            policy is never faster.
+        center: (D,) in the unit.
+
+    Raises:
+        PolicyError: if a scale is not positive, or a number is not finite.
+    """
+
+    name: str
+    unit: str
+    scale: tuple[float, ...]
+    center: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not self.scale or len(self.scale) != len(self.center):
+            raise PolicyError(
+                f"command {self.name!r}: {len(self.scale)} scales and {len(self.center)} centers, "
+                "expected one per value"
+            )
+        for scale in self.scale:
+            if not 0.0 < scale < np.inf:
+                raise PolicyError(
+                    f"command {self.name!r}: scale is {scale}, expected a finite number above 0"
+                )
+        if not np.isfinite(self.center).all():
+            raise PolicyError(
+                f"command {self.name!r}: center is {list(self.center)}, expected finite numbers"
+            )
+
+    @property
+    def width(self) -> int:
+        """Number of values D."""
+        return len(self.scale)
+
+    def check(self, topic_map: TopicMap, where: str) -> None:
+        """Refuse a topic map that has another field under this name; see `ActionSpec.check`."""
+        found = _command_field(topic_map, self.name, where)
+        if (len(found.values), found.unit or "1") != (self.width, self.unit or "1"):
+            raise PolicyError(
+                f"{where}: command {self.name!r} of the topic map has {len(found.values)} values "
+                f"in {found.unit!r}, expected {self.width} in {self.unit!r}"
+            )
+
+    def scaled(self, episode: Episode) -> Floats:
+        """(T, D) commands of the whole episode as outputs, not clipped."""
+        return (episode.field(self.name) - self.center) / self.scale
+
+    def command(self, output: Floats) -> Floats:
+        """(D,) command that an output means."""
+        values: Floats = output * self.scale + self.center
+        return values
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data."""
+        return {
+            "kind": "scaled",
+            "name": self.name,
+            "unit": self.unit,
+            "scale": list(self.scale),
+            "center": list(self.center),
+        }
+
+
+@dataclass(frozen=True)
+class GripperCommand:
+    """The gripper's command: one output, -1 open to +1 closed, whatever the robot's numbers.
+
+    A policy commands the two ends alone: its output's sign decides.
+
+    Attributes:
+        name: field of the topic map.
+        kind: `binary` or `continuous`, see `GripperSpec`.
+        open_value, closed_value: the command at either end.
+    """
+
+    name: str
+    kind: str = "binary"
+    open_value: float = -1.0
+    closed_value: float = 1.0
+
+    def __str__(self) -> str:
+        ends = f"{self.open_value:g} open to {self.closed_value:g} closed"
+        return f"{self.kind} {self.name!r}, {ends}"
+
+    @property
+    def width(self) -> int:
+        """One output."""
+        return 1
+
+    def check(self, topic_map: TopicMap, where: str) -> None:
+        """Refuse a gripper whose numbers mean something else; see `ActionSpec.check`."""
+        found = gripper_command_of(topic_map)
+        if found != self:
+            raise PolicyError(f"{where}: the topic map's gripper is {found}, expected {self}")
+        spec = _command_field(topic_map, self.name, where)
+        if len(spec.values) != 1:
+            raise PolicyError(
+                f"{where}: gripper {self.name!r} of the topic map has {len(spec.values)} values, "
+                "expected 1"
+            )
+
+    def scaled(self, episode: Episode) -> Floats:
+        """(T, 1) command in force: a step that holds has that of the last command before it."""
+        return (-commanded(episode)).astype(np.float64)[:, None]
+
+    def command(self, output: Floats) -> Floats:
+        """(1,) the end that the sign of the output means; exactly 0 holds."""
+        if output[0] == 0.0:
+            is_binary = self.kind == "binary"
+            hold = 0.0 if is_binary else (self.open_value + self.closed_value) / 2.0
+            return np.array([hold])
+        return np.array([self.closed_value if output[0] > 0.0 else self.open_value])
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data."""
+        return {
+            "kind": "gripper",
+            "name": self.name,
+            "command": self.kind,
+            "open_value": self.open_value,
+            "closed_value": self.closed_value,
+        }
 
 
 @dataclass(frozen=True)
 class ActionSpec:
     """How commands become targets in [-1, 1] and outputs become commands.
 
+    Make one with `action_spec`, which takes missing scales from the demonstrations.
+
     Attributes:
-        scale: command (unitless, as on `command/twist`) that is an output of 1. Demonstrations
-            move slower than they may; targets that fill [-1, 1] are learned far better than small
-            ones. Faster commands are clipped to it, so the policy is never faster than `scale`.
+        commands: command fields in the order of the outputs.
 
     Raises:
-        PolicyError: if the scale is not in (0, 1].
+        PolicyError: if there is no field, or one is there twice.
     """
 
-    scale: float = 0.2
+    commands: tuple[ScaledCommand | GripperCommand, ...]
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.scale <= 1.0:
-            raise PolicyError(f"action scale is {self.scale}, expected a number in (0, 1]")
+        if not self.commands:
+            raise PolicyError("an action needs at least one command field, found none")
+        if len(set(self.fields)) < len(self.fields):
+            raise PolicyError(f"an action names a field twice: {', '.join(self.fields)}")
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the command fields."""
+        return tuple(command.name for command in self.commands)
+
+    @property
+    def width(self) -> int:
+        """Number of outputs A."""
+        return sum(command.width for command in self.commands)
 
     def check(self, topic_map: TopicMap, where: str) -> None:
         """Refuse a topic map whose commands mean something else.
@@ -44,73 +211,199 @@ class ActionSpec:
             where: whose requirement it is, for the message.
 
         Raises:
-            PolicyError: if there is no twist of three unitless values, or the gripper's command
-                does not go from -1, open, to +1, closed.
+            PolicyError: if a field is missing, is no command, or has another width, unit or
+                meaning.
         """
-        twist = topic_map.fields.get(TWIST)
-        if twist is None or len(twist.values) != 3 or twist.unit not in ("", "1"):
-            found = "none" if twist is None else f"{len(twist.values)} in {twist.unit!r}"
-            raise PolicyError(
-                f"{where}: the topic map's field {TWIST!r} must have 3 unitless values, "
-                f"found {found}"
-            )
-        gripper = topic_map.gripper
-        ends = None if gripper is None else (gripper.open_value, gripper.closed_value)
-        if ends != (GRIPPER_OPEN, GRIPPER_CLOSED):
-            raise PolicyError(
-                f"{where}: the topic map's gripper (open, closed) is {ends}, "
-                f"expected {(GRIPPER_OPEN, GRIPPER_CLOSED)}"
-            )
+        for command in self.commands:
+            command.check(topic_map, where)
 
-    def targets(self, episode: Episode, span: Span | None = None) -> Floats:
-        """What the network should answer to the steps of an episode.
-
-        The gripper's target is the command in force: a step that holds has the target of the last
-        command before it, inside the span or not. Before the first command it is 0.
+    def scaled(self, episode: Episode, span: Span | None = None) -> Floats:
+        """Commands as outputs, not clipped.
 
         Args:
-            episode: the whole episode.
+            episode: the whole episode: what a gripper holds may have been commanded before the
+                span.
             span: nanoseconds from the start stamp, inclusive; None: all steps.
 
         Returns:
-            (T, 4) in [-1, 1]: twist / scale, clipped, and -1 open to +1 closed.
+            (T, A): (command - center) / scale; of a gripper -1 open to +1 closed, and 0 before
+            its first command.
 
         Raises:
-            PolicyError: if a field is missing or means something else, or a twist in the span is
-                not finite.
+            PolicyError: if a field is missing or means something else, or a command in the span
+                is not finite.
         """
-        scaled = self._scaled(episode, span)
-        return np.clip(scaled, -1.0, 1.0)
-
-    def clipped_fraction(self, episode: Episode, span: Span | None = None) -> float:
-        """Fraction of the values of the twist that `targets` clips; raises as it does."""
-        return float(np.mean(np.abs(self._scaled(episode, span)[:, :3]) > 1.0))
-
-    def command(self, output: Floats) -> tuple[Floats, float]:
-        """The command that an output of the network means.
-
-        Args:
-            output: (4,) in [-1, 1].
-
-        Returns:
-            (3,) twist in [-scale, scale], and the gripper: the sign of the output, -1 opens, +1
-            closes. Exactly 0 is 0, which holds what was last commanded.
-        """
-        return output[:3] * self.scale, float(np.sign(output[3]))
-
-    def _scaled(self, episode: Episode, span: Span | None) -> Floats:
         where = f"episode {episode.id}"
         self.check(episode.topic_map, where)
         try:
-            twist = episode.field(TWIST)
-            # Of the whole episode: what a cut begins with may have been commanded before it.
-            gripper = 1.0 * is_closed_command(episode) - is_open_command(episode)
+            columns = [command.scaled(episode) for command in self.commands]
         except CurationError as err:
             raise PolicyError(str(err)) from err
-        every = np.column_stack([twist / self.scale, gripper])
         stamps = episode.stamps_ns - episode.start_ns
-        part = every if span is None else every[(stamps >= span[0]) & (stamps <= span[1])]
-        bad = np.flatnonzero(~np.isfinite(part).all(axis=1))
+        inside = slice(None) if span is None else (stamps >= span[0]) & (stamps <= span[1])
+        for command, values in zip(self.commands, columns, strict=True):
+            bad = np.flatnonzero(~np.isfinite(values[inside]).all(axis=1))
+            if len(bad):
+                raise PolicyError(f"{where}: {command.name} in row {bad[0]} is not finite")
+        every: Floats = np.concatenate(columns, axis=1)[inside]
+        return every
+
+    def targets(self, episode: Episode, span: Span | None = None) -> Floats:
+        """(T, A) what the network should answer, in [-1, 1]; arguments as of `scaled`."""
+        return np.clip(self.scaled(episode, span), -1.0, 1.0)
+
+    def clipped_shares(self, scaled: Floats) -> dict[str, float]:
+        """Share of the values of each field that are beyond its scale, of (T, A) `scaled`.
+
+        A gripper has no scale, and no share.
+        """
+        beyond = np.abs(scaled) > 1.0 + _ROUNDING
+        return {
+            command.name: float(beyond[:, place].mean())
+            for command, place in zip(self.commands, self._places, strict=True)
+            if isinstance(command, ScaledCommand)
+        }
+
+    def command(self, output: Floats) -> dict[str, Floats]:
+        """The command that an output means.
+
+        Args:
+            output: (A,) in [-1, 1].
+
+        Returns:
+            (d,) values of each field, in its unit.
+        """
+        return {
+            command.name: command.command(output[place])
+            for command, place in zip(self.commands, self._places, strict=True)
+        }
+
+    @cached_property
+    def _places(self) -> tuple[slice, ...]:
+        """Outputs of each command."""
+        ends = list(itertools.accumulate((c.width for c in self.commands), initial=0))
+        return tuple(slice(*pair) for pair in itertools.pairwise(ends))
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """Plain data that `action_from_json` reads back to an equal spec."""
+        return [command.to_json() for command in self.commands]
+
+
+def action_spec(
+    terms: Sequence[CommandTerm],
+    topic_map: TopicMap,
+    episodes: Iterable[tuple[Episode, Span | None]],
+    where: str,
+) -> ActionSpec:
+    """Make a spec of the command fields that a variant names.
+
+    Args:
+        terms: in the order of the outputs.
+        topic_map: of the episodes.
+        episodes: what missing scales and centers are taken from, with their spans.
+        where: source of the terms, for messages.
+
+    Raises:
+        PolicyError: if a field is missing or no command, a scale has another number of values, or
+            the demonstrations have commands that are not finite.
+    """
+    demonstrations, gripper = list(episodes), gripper_command_of(topic_map)
+    commands: list[ScaledCommand | GripperCommand] = []
+    for term in terms:
+        spec = _command_field(topic_map, term.field, where)
+        if gripper is not None and gripper.name == term.field:
+            commands.append(gripper)
+            continue
+        width = len(spec.values)
+        scale = _per_value(term.scale, width, f"{where}: scale of {term.field!r}")
+        center = _per_value(term.center, width, f"{where}: center of {term.field!r}")
+        if not (scale and center):
+            low, high = _range(term.field, demonstrations, where)
+            center = center or tuple(map(float, (low + high) / 2.0))
+            reach = np.maximum(np.abs(low - center), np.abs(high - center))
+            scale = scale or tuple(map(float, np.where(reach > 0.0, reach, _NO_MOTION)))
+        try:
+            commands.append(ScaledCommand(term.field, spec.unit, scale, center))
+        except PolicyError as err:
+            raise PolicyError(f"{where}: {err}") from err
+    try:
+        return ActionSpec(tuple(commands))
+    except PolicyError as err:
+        raise PolicyError(f"{where}: {err}") from err
+
+
+def action_from_json(raw: object, where: str) -> ActionSpec:
+    """Check plain data and make a spec of it.
+
+    Raises:
+        PolicyError: naming the source, what was found and what was expected.
+    """
+    commands: list[ScaledCommand | GripperCommand] = []
+    try:
+        if not isinstance(raw, list):
+            raise TypeError
+        for entry in raw:
+            name = str(entry["name"])
+            if entry["kind"] == "gripper":
+                ends = float(entry["open_value"]), float(entry["closed_value"])
+                commands.append(GripperCommand(name, str(entry["command"]), *ends))
+                continue
+            scale, center = (tuple(map(float, entry[key])) for key in ("scale", "center"))
+            commands.append(ScaledCommand(name, str(entry["unit"]), scale, center))
+        return ActionSpec(tuple(commands))
+    except PolicyError as err:
+        raise PolicyError(f"{where}: {err}") from err
+    except (KeyError, TypeError, ValueError) as err:
+        raise PolicyError(
+            f"{where}: 'action' is {raw!r:.60}, expected a list of commands with kind and name"
+        ) from err
+
+
+def gripper_command_of(topic_map: TopicMap) -> GripperCommand | None:
+    """The gripper's command by its meaning in a topic map; None where the robot has none."""
+    spec = topic_map.gripper
+    if spec is None:
+        return None
+    return GripperCommand(spec.field, spec.kind, spec.open_value, spec.closed_value)
+
+
+def _command_field(topic_map: TopicMap, name: str, where: str) -> FieldSpec:
+    spec = topic_map.fields.get(name)
+    if spec is None or spec.role not in _ROLES:
+        commands = ", ".join(f.name for f in topic_map.with_role(*_ROLES)) or "none"
+        has = "no field" if spec is None else f"role {spec.role} for"
+        raise PolicyError(
+            f"{where}: the topic map has {has} {name!r}, expected a command (role action or "
+            f"gripper); its commands are {commands}"
+        )
+    return spec
+
+
+def _per_value(given: tuple[float, ...], width: int, what: str) -> tuple[float, ...]:
+    """One number per value, or nothing where the demonstrations decide."""
+    if len(given) == 1:
+        return given * width
+    if given and len(given) != width:
+        raise PolicyError(f"{what} has {len(given)} numbers, expected 1 or {width}")
+    return given
+
+
+def _range(
+    name: str, episodes: Sequence[tuple[Episode, Span | None]], where: str
+) -> tuple[Floats, Floats]:
+    """(D,) least and (D,) largest command of the demonstrations."""
+    lows, highs = [], []
+    for episode, span in episodes:
+        try:
+            values = (episode if span is None else episode.within(span)).field(name)
+        except CurationError as err:
+            raise PolicyError(str(err)) from err
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(bad):
-            raise PolicyError(f"{where}: {TWIST} in row {bad[0]} is not finite")
-        return part
+            raise PolicyError(f"episode {episode.id}: {name} in row {bad[0]} is not finite")
+        if len(values):
+            lows.append(values.min(axis=0))
+            highs.append(values.max(axis=0))
+    if not lows:
+        raise PolicyError(f"{where}: no step to take the scale of {name!r} from")
+    return np.min(lows, axis=0), np.max(highs, axis=0)

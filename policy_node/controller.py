@@ -1,59 +1,70 @@
-"""Drives a policy through an episode: the same object in the ROS node and in rollouts."""
+"""Drives a policy of any kind through an episode: the same object in the ROS node and rollouts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
-import numpy.typing as npt
 
 from curation_ros.core.errors import PolicyError
-from curation_ros.core.types import Floats
-from policy_node.observation import PHASE
-from policy_node.policy import Policy
+from policy_node.policy import Command, Policy, Values, check_observed
 
 
 class PolicyController:
-    """Remembers what the first step of the episode looked like; nothing else has a memory.
+    """Shows each step to a policy once, and answers the step with one command.
 
-    So the same values answered twice give the same command, and `reset` makes a new episode.
+    A step that is repeated, as the simulator does in lockstep, gets the same command again.
 
     Args:
-        policy: what decides.
+        policy: what decides. It is reset, and must drive nothing else meanwhile.
     """
 
     def __init__(self, policy: Policy) -> None:
         self.policy = policy
-        self._start: dict[str, Floats] | None = None
+        self.reset()
 
     def reset(self) -> None:
         """Forget the episode: the next step is the first of another one."""
-        self._start = None
+        self.policy.reset()
+        self._observed_step: int | None = None
+        self._command: Command | None = None
 
-    def act(self, values: Mapping[str, npt.ArrayLike], phase_index: int) -> tuple[Floats, float]:
+    def answer(self, step: int, values: Values) -> Command:
         """The command that answers one step.
 
         Args:
-            values: (d,) values by field of the topic map; more than needed is no harm.
-            phase_index: place of the present phase in the policy's phase labels.
+            step: number or stamp of the step; grows from step to step.
+            values: by field of the topic map; fields that the policy does not observe are ignored.
 
         Returns:
-            (3,) twist, unitless in [-1, 1], and the gripper: -1 opens, +1 closes, 0 holds.
+            (d,) values of each field that the policy commands.
 
         Raises:
-            PolicyError: if a field is missing, has a wrong width or is not finite, or there is
-                no such phase. A first step that raises is not remembered.
+            PolicyError: if a field is missing or unusable, the step is older than the last one, or
+                the policy's command is incomplete or not finite. A step that the policy has not
+                taken may be tried again.
         """
-        spec = self.policy.spec
-        for name in spec.fields:
-            if name not in values and name != PHASE:
+        last = self._observed_step
+        if last is not None and step < last:
+            raise PolicyError(f"step {step} comes after step {last}, expected a later one")
+        if step == last and self._command is not None:
+            return self._command
+        if step != last:
+            check_observed(values, self.policy.observed)
+            self.policy.observe(values)
+            self._observed_step, self._command = step, None
+        self._command = self._checked(self.policy.act())
+        return self._command
+
+    def _checked(self, command: Command) -> Command:
+        policy = self.policy
+        if set(command) != set(policy.commanded):
+            raise PolicyError(
+                f"policy {policy.card.id}: its command has {', '.join(command) or 'no field'}, "
+                f"expected {', '.join(policy.commanded)}"
+            )
+        for name, values in command.items():
+            if not np.isfinite(values).all():
                 raise PolicyError(
-                    f"observation: no field {name!r}; it has {', '.join(values) or 'none'}"
+                    f"policy {policy.card.id}: its command {name} is {values}, "
+                    "expected finite numbers"
                 )
-        start = self._start
-        if start is None:
-            # Copies: the caller may fill the same arrays anew in the next step.
-            start = {k: np.array(values[k], dtype=np.float64) for k in spec.start_fields}
-        command = self.policy.act(spec.from_step({**values, PHASE: [phase_index]}, start))
-        self._start = start
         return command

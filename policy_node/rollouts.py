@@ -64,8 +64,15 @@ class SimController:
         self._controller = PolicyController(policy)
 
     def act(self, step: Step) -> tuple[Floats, float]:
-        """Twist and gripper, as `PolicyController.act` says."""
-        return self._controller.act(field_values(step.observation), step.phase_index)
+        """(3,) twist and the gripper's command, each in [-1, 1].
+
+        Raises:
+            PolicyError: if the policy cannot answer the observation.
+        """
+        values = {**field_values(step.observation), "phase": np.array([float(step.phase_index)])}
+        command = self._controller.answer(step.index, values)
+        # A policy that was trained without a gripper leaves it as it is.
+        return command["twist"], float(command["gripper"][0]) if "gripper" in command else 0.0
 
 
 class GiveUp:
@@ -147,7 +154,9 @@ def rollout(
         give_up=GiveUp() if gives_up else None,
     )
     ended = "success" if result.is_success else result.given_up or "max_steps"
-    return Rollout(policy.id, start.name, result.is_success, result.n_steps, result.stage, ended)
+    return Rollout(
+        policy.card.id, start.name, result.is_success, result.n_steps, result.stage, ended
+    )
 
 
 def evaluate(

@@ -87,8 +87,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.dry_run:
         wanted = {policy for cell in study.cells for policy in cell.policies.values()}
-        trained = {row["policy"] for row in study.judge.rows("policy") if row["status"] == "ok"}
-        rolled = sum(row["status"] == "ok" for row in study.judge.rows("rollout"))
+        trained = {row["policy"] for row in study.trials.rows("policy") if row["status"] == "ok"}
+        rolled = sum(row["status"] == "ok" for row in study.trials.rows("rollout"))
         if args.json:
             print_json(
                 {"policies": len(wanted), "trained": len(wanted & trained), "rollouts": rolled}

@@ -35,21 +35,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a row a rollout, then the summary."""
-    from policy_node.policy import Policy
+    from policy_node.policy import load_policy
 
     if not 1 <= args.max_steps <= _MOST_STEPS:
         raise ConfigError(f"--max-steps {args.max_steps}: expected 1 to {_MOST_STEPS}")
-    policy = Policy.load(args.policy)
+    policy = load_policy(args.policy)
     policy.check(topic_map_or_default(""))
     rows = []
-    for row in _rollouts(args, policy):
+    for row in _rollouts(args, policy.card.id):
         rows.append(row)
         if args.json:
             print_json(row)
         else:
             outcome = "success" if row["success"] else f"failed in {row['stage']}"
             say(f"{row['start']}: {outcome} after {row['steps']} steps")
-    total = summary(policy.id, rows)
+    total = summary(policy.card.id, rows)
     if args.json:
         print_json(total)
     else:
@@ -58,19 +58,19 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _rollouts(args: argparse.Namespace, policy: Any) -> Iterator[dict[str, Any]]:
+def _rollouts(args: argparse.Namespace, policy_id: str) -> Iterator[dict[str, Any]]:
     if args.graph:
         logs = args.logs or Path(tempfile.mkdtemp(prefix="curation_ros-logs-"))
         if progress_console.is_terminal:  # it takes some seconds until the first row
             text = f"starting sim_node and policy_node, their logs are in {logs}"
             progress_console.print(text, markup=False, soft_wrap=True)
         yield from evaluate_on_graph(
-            args.policy, policy.id, args.starts, max_steps=args.max_steps, log_folder=logs
+            args.policy, policy_id, args.starts, max_steps=args.max_steps, log_folder=logs
         )
         if args.logs is None:  # after an error they stay: the message names them
             shutil.rmtree(logs, ignore_errors=True)
         return
-    from curation_ros.study.units import roll_policy
+    from curation_ros.study.unit_work import roll_policy
     from sim_node.starts import start_names
 
     tasks = [(args.policy, name, args.max_steps) for name in start_names(args.starts)]

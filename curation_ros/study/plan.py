@@ -15,6 +15,7 @@ import yaml
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.scorers import SCORERS, find_scorer, is_scorer
 from curation_ros.study.terms import Term, parse_row
+from policy_node.settings import DEFAULTS
 
 #: What a stage is for. Results of `screen` are for exploring; nothing is claimed from them.
 KINDS = ("protocol", "screen", "confirm")
@@ -115,7 +116,7 @@ class StudyPlan:
     budget_steps: int = 4_000_000
     max_steps: int = 500
     gives_up: bool = True
-    gradient_steps: int = 4000
+    gradient_steps: int = DEFAULTS.steps
     length: str = "shortest-reference"
     length_value: float | None = None
     scorers: tuple[str, ...] = ()

@@ -36,8 +36,10 @@ _FREE = {"nothing", "dataset"}
 
 def results(study: Study) -> Row:
     """All that a study has found, as `results.json` holds it; docs/study.md names the keys."""
-    plan, judge = study.plan, study.judge
-    rollouts = {(r["policy"], r["start"]): r for r in judge.rows("rollout") if r["status"] == "ok"}
+    plan, trials = study.plan, study.trials
+    rollouts = {
+        (r["policy"], r["start"]): r for r in trials.rows("rollout") if r["status"] == "ok"
+    }
     stages = [_stage(study, stage, rollouts) for stage in plan.stages]
     return {
         "format": FORMAT,
@@ -54,11 +56,11 @@ def results(study: Study) -> Row:
         },
         "budget": {
             "declared_steps": plan.budget_steps,
-            "used_steps": judge.used_steps,
+            "used_steps": trials.used_steps,
             "max_steps": plan.max_steps,
             "gives_up": plan.gives_up,
             "rollouts": len(rollouts),
-            "policies": len({r["policy"] for r in judge.rows("policy") if r["status"] == "ok"}),
+            "policies": len({r["policy"] for r in trials.rows("policy") if r["status"] == "ok"}),
         },
         "reference": {"n": study.n_reference},
         "stages_left_out": _left_out(plan),

@@ -18,7 +18,8 @@ from curation_ros.study.plan import Stage, StudyPlan
 from curation_ros.study.pools import Pool, score_pool
 from curation_ros.study.terms import parse_row
 from curation_ros.study.training_sets import TrainingSet, training_set
-from curation_ros.study.units import Judge, PolicyUnit, RolloutUnit, Row, Work
+from curation_ros.study.trials import PolicyTrials, Work
+from curation_ros.study.units import PolicyUnit, RolloutUnit, Row
 
 Said = Callable[[str], None]
 #: What is told of a unit that was done: which stage, what kind, how many of how many.
@@ -67,7 +68,7 @@ class Study:
 
     Attributes:
         plan: of it.
-        judge: that has its policies and rollouts.
+        trials: its policies and rollouts.
         pools: by name, scored.
         reference: trusted demonstrations.
         cells: all of the plan, in its order.
@@ -78,7 +79,7 @@ class Study:
     """
 
     plan: StudyPlan
-    judge: Judge
+    trials: PolicyTrials
     pools: Mapping[str, Pool]
     reference: Dataset
     cells: tuple[Cell, ...]
@@ -136,7 +137,7 @@ def run_study(
             pools[name] = score_pool(name, datasets[name], reference, plan)
             timelines |= pools[name].timelines
             said(f"pool {name}: {len(plan.scorers)} scorers, {pools[name].facts['n']} scored")
-    judge = Judge(
+    trials = PolicyTrials(
         folder,
         jobs=jobs,
         backend=backend,
@@ -147,15 +148,15 @@ def run_study(
     cells = tuple(_cells(plan, pools, datasets["reference"], datasets.get("more")))
     said(
         f"{len(cells)} cells, {len({p for c in cells for p in c.policies.values()})} policies; "
-        f"{judge.used_steps} of {plan.budget_steps} simulation steps are used"
+        f"{trials.used_steps} of {plan.budget_steps} simulation steps are used"
     )
     found: list[str] = []
     for label, part in _parts(cells) if work else ():
-        found += _train(judge, plan, part, label, clock, said, ticked)
-        found += _roll(judge, part, label, clock, said, ticked)
+        found += _train(trials, plan, part, label, clock, said, ticked)
+        found += _roll(trials, part, label, clock, said, ticked)
     return Study(
         plan=plan,
-        judge=judge,
+        trials=trials,
         pools=pools,
         reference=datasets["reference"],
         cells=cells,
@@ -196,7 +197,7 @@ def _parts(cells: tuple[Cell, ...]) -> Iterator[tuple[str, list[Cell]]]:
 
 
 def _train(
-    judge: Judge,
+    trials: PolicyTrials,
     plan: StudyPlan,
     cells: list[Cell],
     label: str,
@@ -224,14 +225,14 @@ def _train(
         ticked(f"{label}: trained", n, len(units))
 
     with clock.measured("train", label) as fact:
-        work = judge.train(list(units.values()), tick)
+        work = trials.train(list(units.values()), tick)
         fact["units"] = len(work.done)
     said(f"{label}: {len(work.done)} policies trained, {work.known} known, {len(work.failed)} not")
     return [f"policy {row['policy']}: {row['reason']}" for row in work.failed]
 
 
 def _roll(
-    judge: Judge, cells: list[Cell], label: str, clock: _Clock, said: Said, ticked: Ticked
+    trials: PolicyTrials, cells: list[Cell], label: str, clock: _Clock, said: Said, ticked: Ticked
 ) -> list[str]:
     from sim_node.starts import start_names
 
@@ -249,7 +250,7 @@ def _roll(
         ticked(f"{label}: rolled out", n, wanted)
 
     with clock.measured("roll", label) as fact:
-        work: Work = judge.roll(units, tick)
+        work: Work = trials.roll(units, tick)
         fact["units"] = len(work.done)
         fact["steps"] = sum(int(row["steps"]) for row in work.done)
     said(

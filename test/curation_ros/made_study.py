@@ -22,7 +22,7 @@ from curation_ros.study.results import results
 from curation_ros.study.running import Cell, Study
 from curation_ros.study.terms import DECIDED
 from curation_ros.study.training_sets import training_set
-from curation_ros.study.units import Judge
+from curation_ros.study.trials import PolicyTrials
 from sim_node.starts import start_names
 
 N_POINTS = 6 * POINTS_PER_PHASE
@@ -123,13 +123,13 @@ def made_results(
             }
             cells.append(Cell(stage, variant, sets))
     timelines = {i: made for pool in pools.values() for i, made in pool.timelines.items()}
-    judge = Judge(folder, max_steps=plan.max_steps, budget_steps=plan.budget_steps)
+    trials = PolicyTrials(folder, max_steps=plan.max_steps, budget_steps=plan.budget_steps)
     with (folder / "units.jsonl").open("a") as log:
         for line in _units(cells, share, rng):
             log.write(json.dumps(line) + "\n")
     study = Study(
         plan=plan,
-        judge=judge,
+        trials=trials,
         pools=pools,
         reference=reference,
         cells=tuple(cells),
@@ -143,7 +143,7 @@ def made_results(
 
 
 def _units(cells: list[Cell], share: float, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """The log of the judge: purer sets do better, as the seed has it."""
+    """The log of the trials: purer sets do better, as the seed has it."""
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     for cell in cells:
         for seed, made in cell.sets.items():

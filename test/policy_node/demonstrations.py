@@ -9,10 +9,16 @@ import numpy as np
 
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap, read_topic_map
+from policy_node.observation import ObservationSpec, observation_spec
+from policy_node.variants import read_training_config
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 50_000_000
-TOPIC_MAP = read_topic_map(Path(__file__).parents[2] / "config" / "topics.yaml")
+_CONFIG = Path(__file__).parents[2] / "config"
+TOPIC_MAP = read_topic_map(_CONFIG / "topics.yaml")
+#: The variants that the package ships, by name.
+VARIANTS = read_training_config(_CONFIG / "training.yaml").variants
+RELATIVE = VARIANTS["relative"]
 N_STEPS = 60
 
 
@@ -54,6 +60,11 @@ def demonstration(
     )
 
 
+def libero_observation(variant: str = "relative") -> ObservationSpec:
+    """Columns of a variant that the package ships."""
+    return observation_spec(VARIANTS[variant].observation, TOPIC_MAP, variant)
+
+
 def step_values(episode: Episode, k: int) -> dict[str, np.ndarray]:
-    """What a robot would see in step k, by field."""
+    """Observation of step k, by field."""
     return {name: values[k] for name, values in episode.fields.items()}

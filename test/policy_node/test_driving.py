@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from demonstrations import RELATIVE
 from graph import PATIENCE_S
 from pausing import PAUSE, RESUME, pausable
 
@@ -32,8 +33,9 @@ pytest.importorskip("libero", reason="LIBERO is not installed")
 pytest.importorskip("torch", reason="torch is not installed")
 
 from curation_ros.study.collect import Collection, collect  # noqa: E402 - needs LIBERO
-from policy_node.policy import Policy  # noqa: E402 - needs safetensors
+from policy_node.policy import load_policy  # noqa: E402 - needs safetensors
 from policy_node.rollouts import SimController, field_values  # noqa: E402 - needs LIBERO
+from policy_node.settings import TrainingSettings  # noqa: E402 - as its neighbours
 from policy_node.train import train  # noqa: E402 - needs torch
 from sim_node.env import LiberoEnv  # noqa: E402 - needs LIBERO
 from sim_node.episodes import EpisodeLimits, run_episode  # noqa: E402 - needs LIBERO
@@ -51,7 +53,8 @@ def folder(tmp_path_factory):
     shown = Collection(episodes=3, seed=1, starts=START)
     assert [one.problem for one in collect(made / "shown", shown)] == [""] * 3
     episodes = [(read_episode(bag), None) for bag in Dataset(made / "shown").bags()]
-    return train(episodes, seed=0, steps=300).policy.save(made / "policy")
+    trained = train(episodes, RELATIVE, seed=0, settings=TrainingSettings(steps=300))
+    return trained.policy.save(made / "policy")
 
 
 @dataclass
@@ -105,7 +108,7 @@ def in_process(folder):
         result = run_episode(
             env,
             parse_starts(START)[0],
-            SimController(Policy.load(folder)),
+            SimController(load_policy(folder)),
             EpisodeLimits(MAX_STEPS, steps_after_success=0),
             on_step=lambda step, command: steps.append((step, command)),
         )
@@ -270,15 +273,19 @@ def other_columns(card):
 
 
 def other_width(card):
-    card["widths"][0] += 1
+    card["settings"]["hidden"][0] += 1
 
 
 def other_scale(card):
-    card["action_scale"] = 1.5
+    card["action"][0]["scale"] = [-1.0, 0.2, 0.2]
+
+
+def other_kind(card):
+    card["kind"] = "cnn"
 
 
 def other_phases(card):
-    labels = card["phase_labels"]
+    [labels] = [field["labels"] for field in card["observation"]["fields"] if field["labels"]]
     labels[0], labels[1] = labels[1], labels[0]
     card["columns"] = [
         name.replace(labels[0], "x").replace(labels[1], labels[0]).replace("x", labels[1])
@@ -289,9 +296,10 @@ def other_phases(card):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (other_columns, "columns of variant 'relative': found"),
-        (other_width, "'widths' are ["),
-        (other_scale, "action scale is 1.5, expected a number in (0, 1]"),
+        (other_columns, "columns: found "),
+        (other_width, "expected float32 (257, 21)"),
+        (other_scale, "command 'twist': scale is -1.0, expected a finite number above 0"),
+        (other_kind, "kind 'cnn' of policy is none of mlp"),
         (other_phases, "the topic map's phases are PREGRASP, DESCEND, "),
         (None, "No such file or directory"),
     ],

@@ -6,8 +6,8 @@ import pytest
 import yaml
 from episodes import topic_map
 from graph import MAPPED, JointState, TwistStamped
+from mlps import mlp
 from robot import BOWL, PLATE, Robot, libero_take, plain, stamp_ns
-from test_policy import policy
 
 pytestmark = [pytest.mark.ros, pytest.mark.policy]
 
@@ -17,7 +17,7 @@ COMMANDS = ("command/twist", "command/gripper")
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A policy with random weights: it moves, and every wrong number shows."""
-    return policy().save(tmp_path_factory.mktemp("policies") / "p")
+    return mlp().save(tmp_path_factory.mktemp("policies") / "p")
 
 
 # --- answering ------------------------------------------------------------------------------
@@ -99,7 +99,7 @@ def test_incomplete_observation_waits_for_its_last_topic(answers):
 def test_episode_joined_in_its_middle_is_not_driven(answers):
     steps = answers.begin()
     answers.robot.send(steps[3])
-    answers.graph.problem("policy_node", "its first observation was not seen: not driving it")
+    answers.graph.problem("policy_node", "its first observation was not received: not driving it")
     assert not answers.heard[COMMANDS[0]]
 
 

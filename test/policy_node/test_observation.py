@@ -4,10 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from demonstrations import PERIOD_NS, TOPIC_MAP, demonstration, step_values
+from demonstrations import (
+    PERIOD_NS,
+    TOPIC_MAP,
+    VARIANTS,
+    demonstration,
+    libero_observation,
+    step_values,
+)
 
 from curation_ros.core.errors import PolicyError
-from policy_node.observation import VARIANTS, ObservationSpec
+from policy_node.observation import (
+    ObservationSpec,
+    ObservedField,
+    observation_from_columns,
+    observation_from_json,
+    observation_spec,
+)
 
 variants = pytest.mark.parametrize("variant", VARIANTS)
 
@@ -21,25 +34,25 @@ def start_of(episode):
 
 
 def test_widths_are_those_of_the_design():
-    assert {v: ObservationSpec(v).width for v in VARIANTS} == {"relative": 21, "fingers": 23}
+    assert {v: libero_observation(v).width for v in VARIANTS} == {"relative": 21, "fingers": 23}
 
 
 def test_default_has_no_fingers():
-    assert not any("finger" in name for name in ObservationSpec().columns)
+    assert not any("finger" in name for name in libero_observation().columns)
 
 
 @variants
 def test_columns_are_named_once_each(variant):
-    spec = ObservationSpec(variant)
+    spec = libero_observation(variant)
     assert len(set(spec.columns)) == spec.width == len(spec.is_one_hot)
     assert [n for n, hot in zip(spec.columns, spec.is_one_hot, strict=True) if hot] == [
-        f"phase={label}" for label in spec.phase_labels
+        f"phase={label}" for label in TOPIC_MAP.fields["phase"].labels
     ]
 
 
 @variants
 def test_step_equals_episode_bit_for_bit(variant):
-    spec, episode = ObservationSpec(variant), demonstration(3)
+    spec, episode = libero_observation(variant), demonstration(3)
     rows = spec.from_episode(episode)
     steps = [spec.from_step(step_values(episode, k), start_of(episode)) for k in range(60)]
     np.testing.assert_array_equal(rows, np.array(steps))
@@ -47,7 +60,7 @@ def test_step_equals_episode_bit_for_bit(variant):
 
 def test_columns_hold_what_their_names_say():
     episode = demonstration(4)
-    spec = ObservationSpec("fingers")
+    spec = libero_observation("fingers")
     rows = dict(zip(spec.columns, spec.from_episode(episode).T, strict=True))
     fields = episode.fields
     np.testing.assert_array_equal(rows["eef_position[1]"], fields["eef_position"][:, 1])
@@ -62,7 +75,7 @@ def test_columns_hold_what_their_names_say():
 
 @variants
 def test_start_effect_is_what_moving_an_object_changes(variant):
-    spec, values = ObservationSpec(variant), step_values(demonstration(7), 5)
+    spec, values = libero_observation(variant), step_values(demonstration(7), 5)
     before = spec.from_step(values, values)
     k = 0
     for name in spec.start_fields:
@@ -84,12 +97,12 @@ def test_live_objects_are_not_seen():
             "bowl_position": np.vstack([episode.fields["bowl_position"][:1], np.ones((59, 3))]),
         },
     )
-    spec = ObservationSpec()
+    spec = libero_observation()
     np.testing.assert_array_equal(spec.from_episode(moved), spec.from_episode(episode))
 
 
 def test_span_that_begins_later_keeps_the_start_of_the_whole_episode():
-    episode, spec = demonstration(6), ObservationSpec()
+    episode, spec = demonstration(6), libero_observation()
     span = (41 * PERIOD_NS, 50 * PERIOD_NS)  # step 0 is one period after the start stamp
     part = spec.from_episode(episode, span)
     np.testing.assert_array_equal(part, spec.from_episode(episode)[40:50])
@@ -98,7 +111,7 @@ def test_span_that_begins_later_keeps_the_start_of_the_whole_episode():
 
 @variants
 def test_missing_field_is_named(variant):
-    spec, episode = ObservationSpec(variant), demonstration(0)
+    spec, episode = libero_observation(variant), demonstration(0)
     values = step_values(episode, 0)
     for name in spec.fields:
         with pytest.raises(PolicyError, match=name):
@@ -115,7 +128,7 @@ def test_missing_field_is_named(variant):
 
 
 def test_other_width_unit_or_phases_are_refused():
-    spec = ObservationSpec()
+    spec = libero_observation()
 
     def changed(name, **changes):
         return replace(
@@ -135,11 +148,11 @@ def test_other_width_unit_or_phases_are_refused():
 def test_unknown_phase_is_refused(index):
     values = {**step_values(demonstration(0), 0), "phase": [index]}
     with pytest.raises(PolicyError, match="phase index"):
-        ObservationSpec().from_step(values, values)
+        libero_observation().from_step(values, values)
 
 
 def test_value_that_is_not_finite_is_refused_inside_the_span_only():
-    episode, spec = demonstration(0), ObservationSpec()
+    episode, spec = demonstration(0), libero_observation()
     eef = episode.fields["eef_position"].copy()
     eef[50, 1] = np.nan
     broken = replace(episode, fields={**episode.fields, "eef_position": eef})
@@ -150,15 +163,148 @@ def test_value_that_is_not_finite_is_refused_inside_the_span_only():
 
 def test_span_without_steps_is_refused():
     with pytest.raises(PolicyError, match="none of its 60 steps"):
-        ObservationSpec().from_episode(demonstration(0), (0, 10))
+        libero_observation().from_episode(demonstration(0), (0, 10))
 
 
 def test_wrong_shape_of_a_step_is_refused():
     values = step_values(demonstration(0), 0)
     with pytest.raises(PolicyError, match=r"'eef_position' has shape \(2,\), expected \(3,\)"):
-        ObservationSpec().from_step({**values, "eef_position": [0.0, 1.0]}, values)
+        libero_observation().from_step({**values, "eef_position": [0.0, 1.0]}, values)
 
 
-def test_unknown_variant_is_refused():
-    with pytest.raises(PolicyError, match="'pixels' is none of relative, fingers"):
-        ObservationSpec("pixels")
+# --- any fields -----------------------------------------------------------------------------
+
+
+def changed_map(**fields):
+    """The topic map with other units, values or roles of some fields."""
+    made = dict(TOPIC_MAP.fields)
+    for name, changes in fields.items():
+        made[name] = replace(made[name], **changes)
+    return replace(TOPIC_MAP, fields=made)
+
+
+def test_terms_over_any_fields_have_the_widths_of_the_topic_map():
+    spec = observation_spec(
+        ["joint_position", "eef_quat_xyzw@start", "bowl_position - eef_position"], TOPIC_MAP, "x"
+    )
+    assert spec.width == 7 + 4 + 3
+    assert spec.columns[0] == "joint_position[0]"
+    assert spec.columns[7] == "eef_quat_xyzw@start[0]"
+    assert spec.columns[-1] == "(bowl_position - eef_position)[2]"
+    assert spec.fields == ("joint_position", "eef_quat_xyzw", "bowl_position", "eef_position")
+    assert spec.start_fields == ("eef_quat_xyzw",)
+    episode = demonstration(1)
+    rows = spec.from_episode(episode)
+    live = episode.fields["bowl_position"] - episode.fields["eef_position"]
+    np.testing.assert_array_equal(rows[:, -3:], live)
+
+
+def test_phases_are_not_needed():
+    spec = observation_spec(["eef_position"], TOPIC_MAP, "x")
+    assert not spec.is_one_hot.any()
+    assert spec.from_step({"eef_position": [1.0, 2.0, 3.0]}, {}).tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("terms", "words"),
+    [
+        (["nose"], "no field 'nose'; it has eef_position"),
+        (["twist"], "field 'twist' has role action: a policy gives commands"),
+        (["gripper"], "field 'gripper' has role gripper"),
+        (["bowl_position - joint_position"], "'joint_position' has 7 in 'rad'; a difference"),
+        (["bowl_position - finger_position"], "'finger_position' has 2 in 'm'"),
+        (["phase@start"], "a phase has one value and stands alone"),
+        (["phase - phase"], "a phase has one value and stands alone"),
+        (["eef_position", "eef_position - phase"], "a phase has one value and stands alone"),
+        ([], "at least one term"),
+    ],
+)
+def test_term_that_makes_no_sense_is_refused(terms, words):
+    with pytest.raises(PolicyError, match=words) as caught:
+        observation_spec(terms, TOPIC_MAP, "variant x")
+    assert str(caught.value).startswith("variant x: ")
+
+
+def test_difference_of_lengths_in_other_units_is_refused():
+    with pytest.raises(PolicyError, match="'m', 'bowl_position' has 3 in 'mm'"):
+        observation_spec(
+            ["eef_position - bowl_position"], changed_map(bowl_position={"unit": "mm"}), "x"
+        )
+
+
+def test_start_effect_is_per_metre_and_of_lengths_alone():
+    topic_map = changed_map(bowl_position={"unit": "mm"}, plate_position={"unit": "cm"})
+    terms = ["joint_position@start", "bowl_position@start", "plate_position@start"]
+    spec = observation_spec([*terms, "bowl_position@start - bowl_position"], topic_map, "x")
+    assert spec.start_effect.shape == (6, 7 + 3 + 3 + 3)
+    assert (spec.start_effect[:, :7] == 0.0).all()  # angles do not move
+    np.testing.assert_array_equal(spec.start_effect[:3, 7:10], 1000.0 * np.eye(3))
+    np.testing.assert_array_equal(spec.start_effect[3:, 10:13], 100.0 * np.eye(3))
+    np.testing.assert_array_equal(spec.start_effect[:3, 13:], 1000.0 * np.eye(3))
+    late = observation_spec(["bowl_position - bowl_position@start"], topic_map, "x")
+    np.testing.assert_array_equal(late.start_effect, -1000.0 * np.eye(3))
+
+
+def test_units_are_compared_with_metres_and_radians():
+    topic_map = changed_map(
+        eef_position={"unit": "mm"}, joint_position={"unit": "deg"}, bowl_position={"unit": "N"}
+    )
+    terms = ["eef_position", "joint_position", "bowl_position", "plate_position", "phase"]
+    spec = observation_spec(terms, topic_map, "x")
+    np.testing.assert_allclose(
+        spec.per_si, [1000.0] * 3 + [57.29577951308232] * 7 + [1.0] * 3 + [1.0] * 3 + [1.0] * 6
+    )
+
+
+def test_no_unit_may_be_written_as_nothing_or_as_1():
+    spec = observation_spec(["eef_quat_xyzw"], TOPIC_MAP, "x")
+    spec.check(changed_map(eef_quat_xyzw={"unit": ""}), "policy x")
+    with pytest.raises(PolicyError, match="'rad', expected '1'"):
+        spec.check(changed_map(eef_quat_xyzw={"unit": "rad"}), "policy x")
+
+
+# --- on cards -------------------------------------------------------------------------------
+
+
+@variants
+def test_plain_data_and_columns_give_the_same_spec_back(variant):
+    spec = libero_observation(variant)
+    assert observation_from_json(spec.to_json(), "x") == spec
+    assert observation_from_columns(spec.columns, "m", "x") == spec
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        (["eef_position[0]", "eef"], "column 'eef', expected a name such as"),
+        (["eef_position[1]"], r"found 'eef_position\[1\]', expected 'eef_position\[0\]'"),
+        (["(a - b)[0]", "b[0]", "b[1]"], "found 3, expected 2"),
+        ([], "at least one term"),
+    ],
+)
+def test_columns_of_no_spec_are_refused(columns, words):
+    with pytest.raises(PolicyError, match=words):
+        observation_from_columns(columns, "m", "card x")
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        None,
+        [],
+        {"terms": ["a"]},
+        {"terms": 5, "fields": []},
+        {"terms": ["a"], "fields": [{"name": "a"}]},
+        {"terms": ["a"], "fields": [{"name": "a", "width": "x", "unit": "", "labels": []}]},
+        {"terms": ["a"], "fields": []},
+        {"terms": ["a"], "fields": [{"name": "a", "width": 0, "unit": "", "labels": []}]},
+    ],
+)
+def test_plain_data_of_no_spec_are_refused(raw):
+    with pytest.raises(PolicyError, match="card x"):
+        observation_from_json(raw, "card x")
+
+
+def test_spec_whose_fields_are_others_than_its_terms_is_refused():
+    with pytest.raises(PolicyError, match="the terms name a, the observed fields are b"):
+        ObservationSpec(("a",), (ObservedField("b", 1),))

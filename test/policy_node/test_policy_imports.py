@@ -15,13 +15,19 @@ HEAVY = ("torch", "mujoco", "robosuite", "libero", "numba", "sim_node")
 ROS = ("rclpy", "sensor_msgs")
 
 
-@pytest.mark.parametrize("module", ["observation", "action", "policy", "controller"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        *("policy", "mlp", "observation", "action", "settings", "variants", "controller"),
+        *("testing", "live", "command_messages"),
+    ],
+)
 def test_acting_needs_neither_torch_nor_simulator_nor_ros(module):
     run_with_blocked(f"policy_node.{module}", (*HEAVY, *ROS))
 
 
 @pytest.mark.policy
-@pytest.mark.parametrize("module", ["train", "batch_training"])
+@pytest.mark.parametrize("module", ["train", "train_many", "training_data"])
 def test_training_needs_neither_simulator_nor_ros(module):
     run_with_blocked(f"policy_node.{module}", (*HEAVY[1:], *ROS))
 

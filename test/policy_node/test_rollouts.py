@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 from demonstrations import TOPIC_MAP
-from test_policy import policy
+from mlps import mlp
+from toy_policies import ChunkedPolicy
 
 from curation_ros.core.episode.phases import PHASES
 
@@ -37,14 +38,14 @@ def test_observations_become_fields_of_the_topic_map(env, start):
     values = field_values(env.reset(start.state))
     for name, value in values.items():
         assert value.shape == (len(TOPIC_MAP.fields[name].values),)
-    assert set(policy(variant="fingers").spec.fields) <= {*values, "phase"}
+    assert set(mlp("fingers").observed) <= {*values, "phase"}
     assert 0.8 < values["bowl_position"][2] < 1.0
 
 
 def test_rollout_is_bounded_and_repeats_exactly(env, start):
     from policy_node.rollouts import evaluate, rollout
 
-    made = policy()
+    made = mlp()
     first = rollout(env, start, made, MAX_STEPS)
     state = env.data.qpos.copy()
     reported = []
@@ -52,7 +53,7 @@ def test_rollout_is_bounded_and_repeats_exactly(env, start):
     assert again == reported == [first, first]
     np.testing.assert_array_equal(env.data.qpos, state)
     assert json.loads(json.dumps(first.to_json())) == {
-        "policy": made.id,
+        "policy": made.card.id,
         "start": start.name,
         "success": False,
         "steps": MAX_STEPS,
@@ -65,7 +66,7 @@ def test_success_ends_the_rollout(env, start, monkeypatch):
     from policy_node.rollouts import rollout
 
     monkeypatch.setattr(env, "is_success", lambda: True)
-    done = rollout(env, start, policy(), MAX_STEPS)
+    done = rollout(env, start, mlp(), MAX_STEPS)
     assert (done.success, done.steps) == (True, 1)
 
 
@@ -92,13 +93,45 @@ def test_a_dropped_bowl_is_given_up_and_a_carried_one_is_not(env, start, defect,
 def test_a_policy_that_goes_nowhere_is_given_up(env, start):
     from policy_node.rollouts import GiveUp, rollout
 
-    class Idle:
-        spec = policy().spec
-        id = "idle"
-
-        def act(self, observation):
-            return np.zeros(3), -1.0
+    class Idle(ChunkedPolicy):
+        def act(self):
+            return {"twist": np.zeros(3), "gripper": np.array([-1.0])}
 
     ended = rollout(env, start, Idle(), gives_up=True)
     assert (ended.success, ended.ended, ended.steps) == (False, "phase", GiveUp.PHASE_STEPS)
     assert ended.stage == PHASES[0]
+
+
+@pytest.mark.parametrize("ensembles", [False, True])
+def test_chunked_policy_is_rolled_out_like_any_other(env, start, ensembles):
+    """Its commands are those that it gives when it is shown the same observations alone."""
+    from policy_node.rollouts import SimController, field_values
+    from sim_node.episodes import EpisodeLimits, run_episode
+
+    steps = []
+    controller = SimController(ChunkedPolicy(horizon=5, ensembles=ensembles))
+    run_episode(
+        env, start, controller, EpisodeLimits(MAX_STEPS), on_step=lambda *s: steps.append(s)
+    )
+    alone = ChunkedPolicy(horizon=5, ensembles=ensembles)
+    for step, executed in steps:
+        alone.observe(field_values(step.observation))
+        command = alone.act()
+        np.testing.assert_array_equal(executed.action_xyz, command["twist"])
+        assert executed.gripper == command["gripper"][0]
+    assert len(steps) == MAX_STEPS
+
+
+def test_policy_without_gripper_leaves_it_as_it_is(env, start):
+    from policy_node.rollouts import SimController
+    from sim_node.tasks.task import Step
+
+    class Handless(ChunkedPolicy):
+        commanded = ("twist",)
+
+        def act(self):
+            return {"twist": super().act()["twist"]}
+
+    step = Step(0, env.reset(start.state), 0, PHASES[0], 0.0)
+    _, gripper = SimController(Handless()).act(step)
+    assert gripper == 0.0

@@ -69,8 +69,9 @@ def test_path_from_bags_to_a_policy(curation: Run, folder: Path) -> None:
     told = curation("train", "--selection", path, "--steps", 5, "--seed", 3, "--json")
     assert told.code == DONE, told.err
     [row] = told.rows
-    assert list(row) == ["policy", "loss", "steps", "seconds"]
-    assert row["steps"] == 5
+    assert list(row) == ["policy", "loss", "steps", "seconds", "variant", "clipped"]
+    assert (row["steps"], row["variant"]) == (5, "relative")
+    assert list(row["clipped"]) == ["twist"]
     card = json.loads((Path(row["policy"]) / "card.json").read_text())
     manifest = json.loads(path.read_text())
     assert Path(row["policy"]).parent == folder / "data" / "policies"

@@ -3,65 +3,26 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import safetensors.numpy
-from demonstrations import TOPIC_MAP
+from demonstrations import TOPIC_MAP, demonstration, libero_observation, step_values
+from mlps import mlp
 
 from curation_ros.core.errors import PolicyError
-from policy_node.observation import ObservationSpec
-from policy_node.policy import CARD, WEIGHTS, Card, Policy, standardise
+from policy_node.controller import PolicyController
+from policy_node.mlp import WEIGHTS, MlpPolicy, standardise
+from policy_node.policy import CARD, load_policy
+from policy_node.testing import check_policy
 
-HIDDEN = 8
-
-
-def card(**changes) -> Card:
-    spec = ObservationSpec(changes.get("variant", "relative"))
-    values = {
-        "id": "01990000-0000-7000-8000-000000000000",
-        "created_at": "2026-01-01T00:00:00+00:00",
-        "variant": spec.variant,
-        "columns": spec.columns,
-        "phase_labels": spec.phase_labels,
-        "action_scale": 0.2,
-        "widths": (spec.width, HIDDEN, 4),
-        "topic_map_hash": TOPIC_MAP.hash,
-        "selection_name": "all",
-        "selection_hash": "abc",
-        "episodes": (
-            {"id": "a", "span": [0, 5], "n_steps": 3},
-            {"id": "b", "span": None, "n_steps": 2},
-        ),
-        "seed": 7,
-        "steps": 100,
-        "batch_size": 256,
-        "lr": 1e-3,
-        "weight_decay": 1e-4,
-        "std_floor": 2e-3,
-        "start_jitter_m": 4e-3,
-        "clipped_fraction": 0.0,
-        "curve": ((100, 0.5),),
-        "seconds": 1.5,
-        "versions": {"python": "3.11"},
-    }
-    return Card(**{**values, **changes})
-
-
-def policy(**changes) -> Policy:
-    made = card(**changes)
-    rng = np.random.default_rng(0)
-    width = len(made.columns)
-    weights = [
-        (rng.normal(size=(n_out, n_in)).astype(np.float32), np.ones(n_out, np.float32))
-        for n_in, n_out in ((width, HIDDEN), (HIDDEN, 4))
-    ]
-    return Policy(made, weights, rng.normal(size=width), rng.uniform(0.1, 1.0, width))
+FORMAT_1 = Path(__file__).parent / "format_1"
 
 
 @pytest.fixture
 def folder(tmp_path):
-    return policy().save(tmp_path / "policies" / "p")
+    return mlp().save(tmp_path / "policies" / "p")
 
 
 def rewrite_card(folder, **changes):
@@ -81,7 +42,7 @@ def rewrite_weights(folder, change):
 
 def assert_refused(folder, *words):
     with pytest.raises(PolicyError) as caught:
-        Policy.load(folder)
+        load_policy(folder)
     message = str(caught.value)
     assert "\n" not in message
     for word in (str(folder), *words):
@@ -89,32 +50,27 @@ def assert_refused(folder, *words):
 
 
 def test_saved_policy_is_loaded_with_the_same_card_and_the_same_bits(folder):
-    loaded, made = Policy.load(folder), policy()
+    loaded, made = MlpPolicy.load(folder), mlp()
     assert loaded.card == made.card
-    assert loaded.id == made.card.id
-    obs = np.random.default_rng(1).normal(size=(20, loaded.spec.width))
+    obs = np.random.default_rng(1).normal(size=(20, loaded.card.observation.width))
     for row in obs:
         np.testing.assert_array_equal(loaded.output(row), made.output(row))
 
 
 def test_output_is_the_written_formula():
-    made = policy()
+    made = mlp()
     arrays = made.arrays
     obs = np.random.default_rng(2).normal(size=21)
     x = standardise(obs, arrays["obs_mean"], arrays["obs_std"])
     x = np.maximum(arrays["layer0.weight"] @ x + arrays["layer0.bias"], 0.0)
     x = np.tanh(arrays["layer1.weight"] @ x + arrays["layer1.bias"])
     np.testing.assert_allclose(made.output(obs), x, atol=1e-6)
-    xyz, gripper = made.act(obs)
-    np.testing.assert_allclose(xyz, 0.2 * x[:3], atol=1e-6)
-    assert gripper == np.sign(x[3])
-    assert isinstance(gripper, float)
 
 
 def test_save_never_overwrites_and_leaves_nothing_behind(folder):
     before = (folder / CARD).read_bytes()
     with pytest.raises(PolicyError, match="exists"):
-        policy(seed=8).save(folder)
+        mlp(seed=8).save(folder)
     assert (folder / CARD).read_bytes() == before
     assert [p.name for p in folder.parent.iterdir()] == ["p"]
 
@@ -122,7 +78,7 @@ def test_save_never_overwrites_and_leaves_nothing_behind(folder):
 def test_save_into_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(PolicyError, match="file"):
-        policy().save(tmp_path / "file" / "p")
+        mlp().save(tmp_path / "file" / "p")
 
 
 @pytest.mark.parametrize("name", [CARD, WEIGHTS])
@@ -146,25 +102,22 @@ def test_every_missing_key_is_refused(folder):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"format": 2}, ("'format' is 2", "expected 1")),
-        ({"variant": "pixels"}, ("'pixels' is none of",)),
-        ({"variant": "fingers"}, ("bowl_position@start[0]", "expected 'finger_position[0]'")),
-        ({"phase_labels": ["A", "B", "C", "D", "E", "F"]}, ("phase=PREGRASP", "phase=A")),
-        ({"phase_labels": []}, ("phase labels",)),
+        ({"format": 3}, ("'format' is 3", "expected 2")),
+        ({"kind": "cnn"}, ("kind 'cnn' of policy is none of mlp",)),
         ({"columns": ["eef_position[0]"]}, ("found 1, expected 21",)),
         ({"columns": "eef_position"}, ("'columns'", "expected list")),
         ({"columns": [1]}, ("'columns' must be a list of str",)),
-        ({"widths": [20, 8, 4]}, ("[20, 8, 4]", "expected 21 first")),
-        ({"widths": [21, 8, 3]}, ("[21, 8, 3]", "4 last")),
-        ({"widths": []}, ("expected 21 first",)),
-        ({"widths": [21, 9, 4]}, (WEIGHTS, "layer0.weight", "expected float32 (9, 21)")),
-        ({"widths": [21, 8, 8, 4]}, (WEIGHTS, "layer2.bias", "missing")),
-        ({"widths": [21, 4]}, (WEIGHTS, "layer1.bias", "not expected")),
-        ({"action_scale": 0}, ("action scale is 0",)),
-        ({"action_scale": True}, ("'action_scale' is True",)),
+        ({"observation": {"terms": []}}, ("'observation'", "expected terms and fields")),
+        ({"action": {}}, ("'action'", "expected a list")),
+        ({"settings": {"hidden": [0]}}, ("hidden is 0",)),
+        ({"settings": {"nose": 1}}, ("unknown key 'nose'",)),
+        ({"settings": {"hidden": [9]}}, (WEIGHTS, "layer0.weight", "expected float32 (9, 21)")),
+        ({"settings": {"hidden": [8, 8]}}, (WEIGHTS, "layer2.bias", "missing")),
         ({"seed": "7"}, ("'seed' is '7'", "expected int")),
+        ({"seconds": True}, ("'seconds' is True",)),
         ({"episodes": [{"id": "a"}]}, ("'episodes'",)),
         ({"curve": [1, 2]}, ("'curve'",)),
+        ({"clipped": {"twist": "much"}}, ("'clipped'",)),
         ({"weights_sha256": "0" * 64}, (WEIGHTS, "expected 000000000000")),
     ],
 )
@@ -231,11 +184,106 @@ def test_arrays_that_do_not_fit_are_refused(folder, change, words):
 @pytest.mark.parametrize("obs", [np.zeros(20), np.zeros((1, 21)), np.full(21, np.nan)])
 def test_observation_that_does_not_fit_is_refused(obs):
     with pytest.raises(PolicyError, match="policy 0199"):
-        policy().act(obs)
+        mlp().output(obs)
+
+
+@pytest.mark.parametrize("variant", ["relative", "fingers"])
+def test_mlp_keeps_the_rules_of_a_policy(variant, tmp_path):
+    episode = demonstration(1)
+    steps = [step_values(episode, k) for k in range(0, 60, 9)]
+    check_policy(lambda: mlp(variant), steps, tmp_path, TOPIC_MAP)
+
+
+@pytest.mark.parametrize("variant", ["relative", "fingers"])
+def test_mlp_observes_what_training_observed(variant):
+    made, episode = mlp(variant), demonstration(1)
+    for k, row in enumerate(libero_observation(variant).from_episode(episode)):
+        made.observe(step_values(episode, k))
+        command = made.act()
+        expected = made.card.action.command(made.output(row))
+        assert list(command) == ["twist", "gripper"]
+        for name, values in command.items():
+            np.testing.assert_array_equal(values, expected[name])
+
+
+def test_values_at_the_start_are_kept_until_reset():
+    made = mlp()
+    first, other = step_values(demonstration(1), 0), step_values(demonstration(2), 0)
+    made.observe(first)
+    made.observe(other)
+    held = made.act()["twist"]
+    made.reset()
+    made.observe(other)
+    assert not np.array_equal(held, made.act()["twist"])
+
+
+def test_refused_first_observation_is_not_the_start():
+    made, values = mlp(), step_values(demonstration(1), 0)
+    for wrong, words in (
+        ({"bowl_position": np.full(3, np.nan)}, "is nan"),
+        ({"bowl_position": np.ones(3), "phase": np.array([9.0])}, "phase index"),
+        ({"eef_position": np.ones(2)}, "has shape"),
+    ):
+        with pytest.raises(PolicyError, match=words):
+            made.observe({**values, **wrong})
+    made.observe(values)
+    fresh = mlp()
+    fresh.observe(values)
+    np.testing.assert_array_equal(made.act()["twist"], fresh.act()["twist"])
+
+
+# --- format 1 -------------------------------------------------------------------------------
+
+
+def test_policy_of_format_1_gives_the_commands_that_it_gave():
+    """Trained and driven at commit d434e8b."""
+    controller = PolicyController(load_policy(FORMAT_1))
+    episode = demonstration(0)
+    for step, twist, gripper in json.loads((FORMAT_1 / "commands.json").read_text()):
+        command = controller.answer(step, step_values(episode, step))
+        assert [value.hex() for value in command["twist"].tolist()] == twist
+        assert command["gripper"].tolist() == [gripper]
+
+
+def test_card_of_format_1_is_read(tmp_path):
+    made = MlpPolicy.load(FORMAT_1)
+    card = made.card
+    assert (card.kind, card.variant, card.widths) == ("mlp", "fingers", (23, 16, 16, 4))
+    assert card.observation == libero_observation("fingers")
+    assert card.action == mlp("fingers").card.action
+    assert (card.settings.steps, card.settings.start_jitter_m) == (130, 4e-3)
+    assert (card.selection_name, card.seed, card.clipped) == ("best", 3, {"twist": 0.0})
+    again = MlpPolicy.load(made.save(tmp_path / "p"))
+    assert again.card == card
+    assert json.loads((tmp_path / "p" / CARD).read_text())["format"] == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"phase_labels": ["A", "B"]}, ("'phase_labels' are ['A', 'B']",)),
+        ({"columns": ["eef_position[1]"]}, ("found 'eef_position[1]'",)),
+        ({"widths": [20, 8, 4]}, ("[20, 8, 4]", "expected 23 first")),
+        ({"widths": [23, 8, 3]}, ("[23, 8, 3]", "4 last")),
+        ({"widths": []}, ("expected 23 first",)),
+        ({"action_scale": 0}, ("scale is 0",)),
+        ({"action_scale": True}, ("'action_scale' is True",)),
+        ({"steps": 0}, ("steps is 0",)),
+        ({"batch_size": "DROP"}, ("'batch_size' is missing",)),
+    ],
+)
+def test_card_of_format_1_that_does_not_fit_is_refused(tmp_path, changes, words):
+    for name in (CARD, WEIGHTS):
+        (tmp_path / name).write_bytes((FORMAT_1 / name).read_bytes())
+    rewrite_card(tmp_path, **changes)
+    assert_refused(tmp_path, *words)
+
+
+# --- robots ---------------------------------------------------------------------------------
 
 
 def test_check_accepts_renamed_topics_and_refuses_other_meanings():
-    made = policy()
+    made = mlp()
     fields = {n: replace(s, topic=f"robot2/{s.topic}") for n, s in TOPIC_MAP.fields.items()}
     renamed = replace(TOPIC_MAP, fields=fields)
     assert renamed.hash != TOPIC_MAP.hash

@@ -1,4 +1,4 @@
-"""The judge's engine: nothing twice, nothing lost, one failure stops nobody else."""
+"""Trials of a study: nothing is done twice or lost, and one failure stops no other unit."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ pytestmark = [pytest.mark.sim, pytest.mark.policy]
 pytest.importorskip("libero", reason="LIBERO is not installed")
 pytest.importorskip("torch", reason="torch is not installed")
 
-from curation_ros.study.units import Judge, PolicyUnit, RolloutUnit, start_name  # noqa: E402 - needs LIBERO
-from policy_node.policy import Policy  # noqa: E402 - as above
+from curation_ros.study.trials import PolicyTrials  # noqa: E402 - needs LIBERO
+from curation_ros.study.unit_work import policy_folder  # noqa: E402 - needs LIBERO
+from curation_ros.study.units import PolicyUnit, RolloutUnit, start_name  # noqa: E402 - needs LIBERO
+from policy_node.policy import load_policy  # noqa: E402 - as above
 
 MAX_STEPS = 6
 STARTS = ("generated:5:0", "generated:5:1", "generated-5-002")
@@ -53,11 +55,11 @@ def rollouts(units: list[PolicyUnit], starts: tuple[str, ...] = STARTS) -> list[
     return [RolloutUnit(unit.key, start) for unit in units for start in starts]
 
 
-def judge(folder: Path, **options: Any) -> Judge:
-    return Judge(folder, max_steps=MAX_STEPS, **options)
+def trials(folder: Path, **options: Any) -> PolicyTrials:
+    return PolicyTrials(folder, max_steps=MAX_STEPS, **options)
 
 
-def results(made: Judge, kind: str) -> dict[Any, Any]:
+def results(made: PolicyTrials, kind: str) -> dict[Any, Any]:
     """Key -> row without what differs from run to run; every unit stands in the log once."""
     rows = made.rows(kind)
     found = {(row["policy"], row.get("start")): {**row, "seconds": 0} for row in rows}
@@ -66,9 +68,9 @@ def results(made: Judge, kind: str) -> dict[Any, Any]:
 
 
 @pytest.fixture
-def study(tmp_path: Path, units: list[PolicyUnit]) -> Judge:
+def study(tmp_path: Path, units: list[PolicyUnit]) -> PolicyTrials:
     """Whose policies are trained."""
-    made = judge(tmp_path / "study")
+    made = trials(tmp_path / "study")
     assert made.train(units).failed == ()
     return made
 
@@ -76,7 +78,7 @@ def study(tmp_path: Path, units: list[PolicyUnit]) -> Judge:
 # --- work ---------------------------------------------------------------------------------------
 
 
-def test_rows_say_what_was_done(study: Judge, units: list[PolicyUnit]) -> None:
+def test_rows_say_what_was_done(study: PolicyTrials, units: list[PolicyUnit]) -> None:
     work = study.roll(rollouts(units))
     assert (len(work.done), work.known, work.failed, work.missing) == (12, 0, (), ())
     first = study.rows("policy")[0]
@@ -89,7 +91,7 @@ def test_rows_say_what_was_done(study: Judge, units: list[PolicyUnit]) -> None:
         "status": "ok",
     }
     assert first["loss"] > 0.0
-    assert Policy.load(study.policy_folder(first["policy"])).card.seed == 0
+    assert load_policy(policy_folder(study.folder, first["policy"])).card.seed == 0
     row = study.rows("rollout")[0]
     assert set(row) == {
         *("kind", "policy", "start", "success", "steps", "stage", "ended", "status", "reason")
@@ -99,11 +101,11 @@ def test_rows_say_what_was_done(study: Judge, units: list[PolicyUnit]) -> None:
     assert study.used_steps == 12 * MAX_STEPS
 
 
-def test_nothing_is_done_twice(study: Judge, units: list[PolicyUnit]) -> None:
+def test_nothing_is_done_twice(study: PolicyTrials, units: list[PolicyUnit]) -> None:
     half = rollouts(units)[:5]
     assert len(study.roll(half).done) == 5
     log = (study.folder / "units.jsonl").read_bytes()
-    again = judge(study.folder)
+    again = trials(study.folder)
     work = again.train([*units, *units])
     assert (work.done, work.known) == ((), 4)
     assert again.roll(half).known == 5
@@ -114,12 +116,12 @@ def test_nothing_is_done_twice(study: Judge, units: list[PolicyUnit]) -> None:
 
 @pytest.mark.parametrize("backend", ["loky", "ray"])
 def test_workers_give_the_same_rows(
-    study: Judge, units: list[PolicyUnit], tmp_path: Path, backend: str
+    study: PolicyTrials, units: list[PolicyUnit], tmp_path: Path, backend: str
 ) -> None:
     """A real local Ray cluster among them."""
     pytest.importorskip(backend if backend == "ray" else "joblib")
     study.roll(rollouts(units))
-    spread = judge(tmp_path / "spread", jobs=2, backend=backend)
+    spread = trials(tmp_path / "spread", jobs=2, backend=backend)
     assert spread.train(units).failed == ()
     assert spread.roll(rollouts(units)).failed == ()
     for kind in ("policy", "rollout"):
@@ -127,7 +129,7 @@ def test_workers_give_the_same_rows(
 
 
 def test_policy_of_other_bags_or_settings_is_refused(
-    study: Judge, units: list[PolicyUnit]
+    study: PolicyTrials, units: list[PolicyUnit]
 ) -> None:
     for changed in (replace(units[0], bags=units[2].bags), replace(units[0], steps=6)):
         with pytest.raises(ConfigError, match="all-relative-s0 was trained on other bags"):
@@ -139,9 +141,9 @@ def test_policy_of_other_bags_or_settings_is_refused(
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_budget_is_kept_and_what_is_missing_is_named(
-    study: Judge, units: list[PolicyUnit], jobs: int
+    study: PolicyTrials, units: list[PolicyUnit], jobs: int
 ) -> None:
-    tight = judge(study.folder, jobs=jobs, budget_steps=5 * MAX_STEPS + 1)
+    tight = trials(study.folder, jobs=jobs, budget_steps=5 * MAX_STEPS + 1)
     asked = rollouts(units)
     work = tight.roll(asked)
     # In whatever order the workers end: the first five of what was asked.
@@ -153,17 +155,17 @@ def test_budget_is_kept_and_what_is_missing_is_named(
         "and it may take 6"
     )
     assert tight.roll(asked).known == 5  # earlier runs count
-    more = judge(study.folder, budget_steps=1000)
+    more = trials(study.folder, budget_steps=1000)
     assert len(more.roll(asked).done) == 7
     declared = [row["budget_steps"] for row in more.rows("declaration")]
     assert declared == [4_000_000, 31, 1000]
 
 
-def test_limits_of_a_study_stay(study: Judge) -> None:
+def test_limits_of_a_study_stay(study: PolicyTrials) -> None:
     with pytest.raises(ConfigError, match="max_steps 6, not 7"):
-        Judge(study.folder, max_steps=7)
+        PolicyTrials(study.folder, max_steps=7)
     with pytest.raises(ConfigError, match="budget_steps -1"):
-        judge(study.folder, budget_steps=-1)
+        trials(study.folder, budget_steps=-1)
 
 
 # --- failures -----------------------------------------------------------------------------------
@@ -175,7 +177,7 @@ def test_failed_training_is_named_and_tried_once_more(
     lost = replace(units[0], set_id="lost", bags=((bags[0].parent / "nobody", None),))
     diverging = replace(units[0], set_id="diverging", start_jitter_m=1e60)
     wanted = [lost, diverging, *units]
-    study = judge(tmp_path / "study")
+    study = trials(tmp_path / "study")
     work = study.train(wanted)
     assert len(work.done) == 4
     reasons = {row["set"]: row["reason"] for row in work.failed}
@@ -191,9 +193,9 @@ def test_failed_training_is_named_and_tried_once_more(
 
 
 def test_failed_rollout_is_named_and_the_rest_goes_on(
-    study: Judge, units: list[PolicyUnit]
+    study: PolicyTrials, units: list[PolicyUnit]
 ) -> None:
-    spoilt = study.policy_folder(units[1].key) / "policy.safetensors"
+    spoilt = policy_folder(study.folder, units[1].key) / "policy.safetensors"
     whole = spoilt.read_bytes()
     spoilt.write_bytes(whole[:-8])
     work = study.roll(rollouts(units, STARTS[:1]))
@@ -207,7 +209,7 @@ def test_failed_rollout_is_named_and_the_rest_goes_on(
 
 
 def test_diverged_simulation_fails_its_rollout_and_its_steps_count(
-    study: Judge, units: list[PolicyUnit], monkeypatch: pytest.MonkeyPatch
+    study: PolicyTrials, units: list[PolicyUnit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from sim_node.env import process_env
 
@@ -247,25 +249,27 @@ while True:
 """
 
 
-def test_worker_that_dies_costs_its_own_unit_alone(study: Judge, units: list[PolicyUnit]) -> None:
+def test_worker_that_dies_costs_its_own_unit_alone(
+    study: PolicyTrials, units: list[PolicyUnit]
+) -> None:
     """A policy that is a pipe: who opens it waits, and is killed while it does."""
-    card = study.policy_folder(units[0].key) / "card.json"
+    card = policy_folder(study.folder, units[0].key) / "card.json"
     text = card.read_bytes()
     card.unlink()
     os.mkfifo(card)
     with subprocess.Popen([sys.executable, "-c", KILLER, str(card)]) as killer:
-        work = judge(study.folder, jobs=2).roll(rollouts(units, STARTS[:1]))
+        work = trials(study.folder, jobs=2).roll(rollouts(units, STARTS[:1]))
         killer.terminate()
     assert (len(work.done), len(work.failed)) == (3, 1)
     assert work.failed[0]["policy"] == units[0].key
     assert "its worker died" in work.failed[0]["reason"]
     card.unlink()
     card.write_bytes(text)
-    assert len(judge(study.folder).roll(rollouts(units, STARTS[:1])).done) == 1
+    assert len(trials(study.folder).roll(rollouts(units, STARTS[:1])).done) == 1
 
 
 def test_full_disk_ends_the_run_and_the_next_goes_on(
-    study: Judge, units: list[PolicyUnit]
+    study: PolicyTrials, units: list[PolicyUnit]
 ) -> None:
     import resource
 
@@ -288,7 +292,8 @@ def test_full_disk_ends_the_run_and_the_next_goes_on(
 RUN = """
 import json, sys
 from pathlib import Path
-from curation_ros.study.units import Judge, PolicyUnit, RolloutUnit
+from curation_ros.study.trials import PolicyTrials
+from curation_ros.study.units import PolicyUnit, RolloutUnit
 folder, bags = sys.argv[1], [Path(p) for p in sys.argv[3:]]
 units = [
     PolicyUnit(name, "relative", seed, tuple((bag, None) for bag in some), steps=5)
@@ -296,9 +301,9 @@ units = [
     for seed in (0, 7)
 ]
 starts = [f"generated:5:{k}" for k in range(12)]
-judge = Judge(Path(folder), jobs=int(sys.argv[2]), max_steps=6)
-judge.train(units)
-judge.roll([RolloutUnit(unit.key, start) for unit in units for start in starts])
+study = PolicyTrials(Path(folder), jobs=int(sys.argv[2]), max_steps=6)
+study.train(units)
+study.roll([RolloutUnit(unit.key, start) for unit in units for start in starts])
 """
 
 
@@ -318,14 +323,14 @@ def test_killed_run_goes_on_with_nothing_done_twice(
     assert before.count(b'"rollout"') < 48
     subprocess.run(command, check=True)
     assert log.read_bytes().startswith(before)
-    study = judge(tmp_path / "study")
+    study = trials(tmp_path / "study")
     assert len(results(study, "policy")) == 4
     assert len(results(study, "rollout")) == 48
     steps = sum(row["steps"] for row in study.rows("rollout"))
     assert study.used_steps == steps == 48 * MAX_STEPS
 
 
-def test_torn_line_is_no_unit(study: Judge, units: list[PolicyUnit]) -> None:
+def test_torn_line_is_no_unit(study: PolicyTrials, units: list[PolicyUnit]) -> None:
     study.roll(rollouts(units))
     log = study.folder / "units.jsonl"
     log.write_bytes(log.read_bytes()[:-20])
@@ -334,22 +339,24 @@ def test_torn_line_is_no_unit(study: Judge, units: list[PolicyUnit]) -> None:
 
 
 def test_policy_saved_but_not_logged_is_taken_as_it_is(
-    study: Judge, units: list[PolicyUnit]
+    study: PolicyTrials, units: list[PolicyUnit]
 ) -> None:
     log = study.folder / "units.jsonl"
     lines = log.read_text().splitlines(keepends=True)
     log.write_text("".join(lines[:-1]))
-    weights = study.policy_folder(units[-1].key) / "policy.safetensors"
+    weights = policy_folder(study.folder, units[-1].key) / "policy.safetensors"
     before = weights.stat().st_mtime_ns
     [row] = study.train(units).done
     assert row == json.loads(lines[-1])
     assert weights.stat().st_mtime_ns == before
 
 
-def test_two_runs_of_a_study_at_once_are_refused(study: Judge, units: list[PolicyUnit]) -> None:
+def test_two_runs_of_a_study_at_once_are_refused(
+    study: PolicyTrials, units: list[PolicyUnit]
+) -> None:
     def again(_: Any) -> None:
         with pytest.raises(CurationError, match="another process runs this study"):
-            judge(study.folder).roll(rollouts(units))
+            trials(study.folder).roll(rollouts(units))
 
     assert len(study.roll(rollouts(units, STARTS[:1]), progress=again).done) == 4
 
@@ -372,7 +379,7 @@ def test_starts_have_names(text: str, name: str) -> None:
 
 @pytest.mark.parametrize("text", ["official:50", "official:0:3", "somewhere", "", "official-50"])
 def test_start_that_is_none_is_refused_before_anything_runs(
-    study: Judge, units: list[PolicyUnit], text: str
+    study: PolicyTrials, units: list[PolicyUnit], text: str
 ) -> None:
     with pytest.raises(ConfigError, match="start"):
         study.roll(rollouts(units, (STARTS[0], text)))

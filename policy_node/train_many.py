@@ -1,4 +1,9 @@
-"""Many policies trained in one computation: the policies of `train`, in less time."""
+"""Trains many policies at once, in groups that share the work of the optimizer.
+
+`train_many` gives the policies of `policy_node.train.train` in about half the time. Initial
+weights, batches and noise are equal; sums are taken in another order, so that losses and weights
+differ by rounding. Use `train` for one policy, `train_many` for the policies of a study.
+"""
 
 from __future__ import annotations
 
@@ -16,24 +21,22 @@ from torch.optim.adam import adam
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import CurationError, PolicyError
 from curation_ros.core.types import Span
-from policy_node.action import N_OUTPUTS
+from policy_node.settings import DEFAULTS, TrainingSettings
 from policy_node.train import (
-    CURVE_EVERY,
-    Settings,
     TrainedPolicy,
-    TrainingSet,
     check_loss,
     check_seed,
-    draws,
     linear_layers,
     new_network,
     one_thread,
     trained_policy,
 )
+from policy_node.training_data import CURVE_EVERY, TrainingData
+from policy_node.variants import Variant
 
 GROUP = 2
-"""Policies in one computation. More share the work of the optimizer, but parameters and moments
-of each are 1.2 MB, which crowd the cache of a core; benchmarks/training_speed.py has both."""
+"""Policies per group. More of them share the work of the optimizer, but parameters and moments of
+each take 1.2 MB, which crowds the cache of a core; benchmarks/training_speed.py measures both."""
 
 JobProgress = Callable[[str, int, float], None]
 
@@ -49,15 +52,15 @@ class TrainingJob:
         key: chosen by the caller, unique.
         episodes: with their spans, as `train` takes them. Jobs of a group that are given the
             same episodes, as objects, and spans share one copy of their rows.
+        variant: what to observe and to command.
         seed: of the initial weights, the batches and the noise.
-        variant: of the observations.
         selection: name and hash of the manifest, for the card.
     """
 
     key: str
     episodes: Sequence[tuple[Episode, Span | None]]
+    variant: Variant
     seed: int
-    variant: str = "relative"
     selection: tuple[str, str] = ("", "")
 
 
@@ -76,48 +79,30 @@ class FailedTraining:
 
 def train_many(
     jobs: Sequence[TrainingJob],
+    settings: TrainingSettings = DEFAULTS,
     *,
-    steps: int = 4000,
-    batch_size: int = 256,
-    lr: float = 1e-3,
-    weight_decay: float = 1e-4,
-    hidden: tuple[int, ...] = (256, 256),
-    std_floor: float = 2e-3,
-    start_jitter_m: float = 0.0,
-    action_scale: float = 0.2,
     group: int = GROUP,
     progress: JobProgress | None = None,
 ) -> Iterator[TrainedPolicy | FailedTraining]:
-    """Train the policies that `train` would, a group of them in one computation.
+    """Train the policies that `train` would, one group after the other.
 
-    Initial weights, batches and noise are those of `train`; sums are taken in another order, so
-    that weights differ by rounding. Equal input gives equal bits on one machine, whatever jobs
-    share the group.
+    Equal input gives equal bits on one machine, whatever jobs share a group.
 
     Args:
         jobs: to train.
-        steps: see `train`, as all up to `action_scale`.
-        batch_size: rows a step and policy.
-        lr: learning rate.
-        weight_decay: L2 penalty.
-        hidden: widths of the hidden layers.
-        std_floor: least standard deviation to divide by, m.
-        start_jitter_m: standard deviation of the noise on where the objects were, m.
-        action_scale: command that is an output of 1.
+        settings: numbers of the training, for all jobs.
         group: largest number of policies in one computation; all of one variant.
         progress: called for each job with key, step and mean loss as `train` does.
 
     Returns:
-        An iterator in the order of the jobs; each step of it that needs a group trains it. A job
-        with a seed out of range, unusable episodes or a loss that is not finite is a
-        FailedTraining; the others go on. `seconds` of a policy are its share of its group's.
+        An iterator in the order of the jobs. A group is trained when the first of its results is
+        asked for. A job with a seed out of range, unusable episodes or a loss that is not finite
+        is a FailedTraining; the other jobs go on. `seconds` of a policy are its share of the time
+        of its group.
 
     Raises:
-        PolicyError: at once, if a setting is out of range or a key is given twice.
+        PolicyError: at once, if `group` is out of range or a key is given twice.
     """
-    settings = Settings(
-        steps, batch_size, lr, weight_decay, hidden, std_floor, start_jitter_m, action_scale
-    )
     if group < 1:
         raise PolicyError(f"training: group is {group}, expected at least 1")
     for key, n in Counter(job.key for job in jobs).items():
@@ -127,7 +112,10 @@ def train_many(
 
 
 def _in_order(
-    jobs: Sequence[TrainingJob], settings: Settings, group: int, progress: JobProgress | None
+    jobs: Sequence[TrainingJob],
+    settings: TrainingSettings,
+    group: int,
+    progress: JobProgress | None,
 ) -> Iterator[TrainedPolicy | FailedTraining]:
     waiting = {job.key: job for job in jobs}
     done: dict[str, TrainedPolicy | FailedTraining] = {}
@@ -142,25 +130,25 @@ def _in_order(
 
 
 def _train_group(
-    jobs: Sequence[TrainingJob], settings: Settings, progress: JobProgress | None
+    jobs: Sequence[TrainingJob], settings: TrainingSettings, progress: JobProgress | None
 ) -> dict[str, TrainedPolicy | FailedTraining]:
     started_s = time.perf_counter()
     done: dict[str, TrainedPolicy | FailedTraining] = {}
-    sets: dict[object, TrainingSet] = {}
+    sets: dict[object, TrainingData] = {}
     learners: list[_Learner] = []
     for job in jobs:
         same = tuple(sorted((id(episode), span or ()) for episode, span in job.episodes))
         try:
             check_seed(job.seed)
             if same not in sets:
-                sets[same] = TrainingSet(job.episodes, job.variant, settings)
+                sets[same] = TrainingData(job.episodes, job.variant, settings)
         except CurationError as err:
             done[job.key] = FailedTraining(job.key, str(err))
         else:
             learners.append(_Learner(job, sets[same], settings))
-    # Robots may name other phases, and observations of these have other columns.
-    for width in dict.fromkeys(learner.data.spec.width for learner in learners):
-        alike = [learner for learner in learners if learner.data.spec.width == width]
+    # Robots may have other phases or fields of other widths, and so networks of other shapes.
+    for widths in dict.fromkeys(learner.widths for learner in learners):
+        alike = [learner for learner in learners if learner.widths == widths]
         with one_thread(), torch.no_grad():
             _fit(alike, settings, progress)
     seconds = (time.perf_counter() - started_s) / len(jobs)
@@ -183,18 +171,20 @@ def _train_group(
 
 
 class _Learner:
-    """A policy in the making.
+    """A policy in training.
 
     Attributes:
-        job: that asks for it.
+        job: its job.
         data: that it learns from.
+        widths: of the layers of its network.
         network: with the initial weights, and at the end the trained ones.
         losses: of every batch so far, up to the first that is not finite.
     """
 
-    def __init__(self, job: TrainingJob, data: TrainingSet, settings: Settings) -> None:
+    def __init__(self, job: TrainingJob, data: TrainingData, settings: TrainingSettings) -> None:
         self.job, self.data = job, data
-        self.network = new_network(data.widths(settings.hidden), job.seed)
+        self.widths = data.widths(settings.hidden)
+        self.network = new_network(self.widths, job.seed)
         self.losses: list[float] = []
 
     @property
@@ -219,15 +209,17 @@ class _Layer(NamedTuple):
     bias_gradient: torch.Tensor
 
 
-def _fit(learners: Sequence[_Learner], settings: Settings, progress: JobProgress | None) -> None:
-    """Train the networks of all learners, whose widths are the same.
+def _fit(
+    learners: Sequence[_Learner], settings: TrainingSettings, progress: JobProgress | None
+) -> None:
+    """Train the networks of all learners, whose widths are equal.
 
-    A step takes one policy after the other through the network and back: its activations stay in
-    the cache of the core, which those of all policies, layer by layer as `torch.bmm` has it, do
-    not; and a product of 256 x 256 matrices keeps a core busy without more of them. What is left,
-    from autograd to an optimizer of many small operations, is done without, or once for all.
+    In a step, the policies take turns through the network and back. The activations of one policy
+    stay in the cache of a core; those of all policies, layer by layer as in `torch.bmm`, do not.
+    A product of 256 x 256 matrices keeps a core busy by itself. There is no autograd, and one call
+    of the optimizer updates all policies.
     """
-    widths = learners[0].data.widths(settings.hidden)
+    widths = learners[0].widths
     n = len(learners)
     parameters, gradients, first_moments, second_moments = (
         torch.zeros(n, _stack_size(widths)) for _ in range(4)
@@ -239,9 +231,9 @@ def _fit(learners: Sequence[_Learner], settings: Settings, progress: JobProgress
             layer.bias.copy_(linear.bias)
     buffers = _Buffers(widths, settings)
     rows = {id(learner.data): _rows(learner.data) for learner in learners}
-    errors = torch.zeros(CURVE_EVERY, n, N_OUTPUTS, settings.batch_size).transpose(2, 3)
+    errors = torch.zeros(CURVE_EVERY, n, widths[-1], settings.batch_size).transpose(2, 3)
     step_count = torch.zeros(())
-    draw = [draws(learner.data, settings, learner.job.seed) for learner in learners]
+    draw = [learner.data.draws(settings, learner.job.seed) for learner in learners]
     for blocks in zip(*draw, strict=True):
         learning = [k for k, learner in enumerate(learners) if not learner.has_failed]
         if not learning:
@@ -283,29 +275,29 @@ def _fit(learners: Sequence[_Learner], settings: Settings, progress: JobProgress
 
 
 class _Buffers:
-    """Where one policy after the other computes: the same memory, so that it stays in the cache.
+    """Memory in which the policies take turns, so that it stays in the cache.
 
     Args:
         widths: of the layers.
         settings: of the training.
     """
 
-    def __init__(self, widths: tuple[int, ...], settings: Settings) -> None:
-        self._row = torch.empty(settings.batch_size, widths[0] + N_OUTPUTS)
+    def __init__(self, widths: tuple[int, ...], settings: TrainingSettings) -> None:
+        self._row = torch.empty(settings.batch_size, widths[0] + widths[-1])
         self._obs, self._targets = self._row[:, : widths[0]], self._row[:, widths[0] :]
-        # Of each layer what goes in, from the observations to the answer, and its gradient.
+        # Input of each layer, from the observations to the answer, and its gradient.
         self._values = [_buffer(settings.batch_size, width) for width in widths]
         self._gradients = [_buffer(settings.batch_size, width) for width in widths]
         for k in range(1, len(widths) - 2):
             if widths[k] == widths[k + 1]:
-                # When the one is written the other has been used: less memory to keep near.
+                # When one is written the other has been used: less memory in the cache.
                 self._gradients[k] = self._values[k + 1]
         self._gradients_t = [gradient.t() for gradient in self._gradients]
         self._is_shifted = settings.start_jitter_m > 0.0
         if not self._is_shifted:
             self._values[0] = self._obs
-        # Of the mean of all squared errors; multiplying by a tensor is quicker than by a number.
-        self._scale = torch.tensor(2.0 / (settings.batch_size * N_OUTPUTS))
+        # Of the mean of all squared errors. Multiplying by a tensor is faster than by a number.
+        self._scale = torch.tensor(2.0 / (settings.batch_size * widths[-1]))
 
     def gather(
         self, rows: torch.Tensor, pick: torch.Tensor, noise: torch.Tensor, jitter: torch.Tensor
@@ -316,7 +308,7 @@ class _Buffers:
             torch.addmm(self._obs, noise, jitter, out=self._values[0])
 
     def backpropagate(self, layers: Sequence[_Layer], error: torch.Tensor) -> None:
-        """Fill the gradients of the mean squared error, and the (B, 4) errors themselves."""
+        """Fill the gradients of the mean squared error, and the (B, A) errors themselves."""
         values, gradients = self._values, self._gradients
         last = len(layers) - 1
         for k, layer in enumerate(layers):
@@ -333,7 +325,7 @@ class _Buffers:
             torch.sum(gradient, 0, out=layer.bias_gradient)
             if k:
                 torch.mm(gradient, layer.weight, out=gradients[k])
-                # After a ReLU: 1 where it let through, 0 where it did not.
+                # Derivative of a ReLU: 1 where its output is positive, else 0.
                 gradients[k].mul_(values[k].sign_())
 
 
@@ -344,8 +336,8 @@ def _buffer(n_rows: int, width: int) -> torch.Tensor:
     return torch.empty(n_rows, width)
 
 
-def _rows(data: TrainingSet) -> torch.Tensor:
-    """(N, D + 4) observations and targets side by side: one gather takes both."""
+def _rows(data: TrainingData) -> torch.Tensor:
+    """(N, D + A) observations and targets side by side: one gather takes both."""
     return torch.cat([data.obs, data.targets], dim=1)
 
 
@@ -376,5 +368,5 @@ def _stack_size(widths: tuple[int, ...]) -> int:
 
 
 def _padded(n: int) -> int:
-    """To whole cache lines: where a row of the stack begins must not change a bit."""
+    """To whole cache lines: the place of a row in the stack must not change a bit."""
     return -(-n // _LINE) * _LINE
