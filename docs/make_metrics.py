@@ -3,7 +3,7 @@
 python docs/make_metrics.py           writes it
 python docs/make_metrics.py --check   compares it; measured costs may differ
 
-What stands between the two marks of the audit is a person's and stays as it is.
+The text between the two marks of the audit is written by hand and stays as it is.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from curation_ros.core.decision.rules import RULES, make_rule
 from curation_ros.core.episode.findings import FINDINGS
 from curation_ros.core.evidence.length_control import MODES
 from curation_ros.core.scorers import DEFAULT_SCORERS, SCORERS, Need, PoolScorer, Scorer
+from curation_ros.testing.scorers import SCORER_RULES
 
 HERE = Path(__file__).resolve().parent
 METRICS = HERE / "metrics.md"
@@ -28,9 +29,9 @@ _COST = "- **Cost**: "
 
 #: What decides which end of the score is the good one, by what the scorer needs.
 ORIENTS: dict[Need, str] = {
-    "nothing": "its definition; whether more of it is better is an assumption",
-    "reference": "the trusted demonstrations: more like them is better",
-    "dataset": "nothing: more like the majority scores higher, be the majority good or bad",
+    "nothing": "its definition; that more of it is better is an assumption",
+    "reference": "the trusted demonstrations: more similar is better",
+    "dataset": "nothing: episodes like the majority score higher, whether good or bad",
     "object pose": "the task",
     "rollouts": "the success of a policy",
     "labels": "a person's labels",
@@ -41,137 +42,166 @@ FORMULAS: dict[str, str] = {
     "of |a_t|, divided by its maximum, up to the last frequency below the cut-off that reaches "
     "the threshold",
     "entropy": "-mean_d std_t(a[t, d])",
-    "gripper_timing": "min{t : open(t), closed(s) for some s < t} / T; 1 where there is none",
+    "gripper_timing": "min{t : open(t), closed(s) for some s < t} / T; 1 if there is none",
     "isolation_forest": "-2^(-E[h(x)] / c(n)), h the depth at which a tree isolates x = (mean, "
     "std, max, min, rms of each action dimension), c(n) its mean over n episodes",
     "ensemble": "0.5 * smoothness + 0.5 * gripper_timing",
     "knn": "-(1/k) * sum over the k nearest episodes r of |x - x_r|, x = (mean, std, rms of each "
     "column of state and action), divided by their standard deviations",
-    "trajectory_alignment": "m . M / (|m| |M|), m the episode's mean state, M the mean over the "
-    "others of theirs",
+    "trajectory_alignment": "m . M / (|m| |M|), m the episode's mean state, M the mean of those "
+    "of the others",
     "length": "-T",
     "object_coupling": "1/n * #{t in LIFT, TRANSPORT : S(s) <= h for all s <= t}, back to where S "
     "began to rise; S(t) = max(0, S(t-1) + min(|o_t - e_t| - r_t - k, 0.6 h)), o and e the "
-    "positions of object and effector, r what their distance was, k = 15 mm + 0.5 sigma, "
+    "positions of object and effector, r their distance before, k = 15 mm + 0.5 sigma, "
     "h = 12 mm + 4 sigma, sigma the noise of o at rest",
     "grip_consistency": "1/n * #{t in LIFT, TRANSPORT : w(s) >= 0.025 W(s) and w(s) - min w <= "
     "0.05 W(s) for all s <= t}, w the gap between the fingers, W its largest so far; with effort "
     "f: f(s) . f(grasp) / |f(grasp)|^2 >= 0.2",
     "phase_events": "-s ln(mean over LIFT, TRANSPORT of exp(-v / s)), v the share of the phase's "
-    "steps before the first one commanded open, 1 where there is none; s = 0.1",
+    "steps before the first one commanded open, 1 if there is none; s = 0.1",
 }
 
-#: What the code cannot know: where each score misleads.
-LIES: dict[str, tuple[str, ...]] = {
+#: What the code cannot know: when each score misleads.
+MISLEADS: dict[str, tuple[str, ...]] = {
     "smoothness": (
-        "On the norm of an action with a binary gripper it measures mostly the gripper's "
-        "constant: `gripper_channel: false` lets the arm be heard.",
-        "Without length control an episode that hovers until the time limit looks smooth: the "
-        "score is then mostly length.",
-        "It does not see what happens: a bowl that drops from a smooth arm is smooth.",
-        "At 20 Hz the cut-off of 10 Hz is half the rate and filters nothing; scores of robots "
-        "of different rates do not compare.",
-        "In a phase-normalised view time is warped; the rate of the recording is then nominal.",
+        "With a binary gripper in the action, the norm measures mostly the gripper's constant. "
+        "`gripper_channel: false` measures the arm.",
+        "Without length control, an episode that hovers until the time limit looks smooth. The "
+        "score then is mostly length.",
+        "It does not see the object: a bowl that drops from a smooth arm is smooth.",
+        "At 20 Hz the cut-off of 10 Hz is half the rate and filters nothing. Scores of robots "
+        "with different rates cannot be compared.",
+        "Phase-normalised episodes have warped time. The rate of the recording is then nominal.",
     ),
     "entropy": (
-        "The gripper's channel dominates: an episode that opens early is open most of the time, "
-        "varies less, and ranks first: on early releases it is inverted.",
-        "It rewards timid motion; only a frozen action abstains.",
+        "The gripper's channel dominates. An episode that opens early is open most of the time, "
+        "varies less, and ranks first: on early releases the score is inverted.",
+        "It rewards timid motion. It abstains only if the action never changes.",
     ),
     "gripper_timing": (
-        "It detects early releases by construction and nothing else: a slipped object, an empty "
-        "grasp or a wrong place score as well as a success.",
-        "A release behind the cut of the length control does not exist: 1.0, as if never opened.",
-        "Chatter of the command right after the grasp counts as the opening.",
-        "It is a share of the steps: where lengths differ, an early release in a long episode "
-        "and a late one in a short episode may score alike.",
+        "It detects early releases by construction and nothing else. A slipped object, an empty "
+        "grasp and a wrong place score like a success.",
+        "A release after the cut of the length control is not seen: it scores 1.0, as if the "
+        "gripper had never opened.",
+        "If the command chatters right after the grasp, that counts as the opening.",
+        "It is a share of the steps. If lengths differ, an early release in a long episode and a "
+        "late one in a short episode may score alike.",
     ),
     "isolation_forest": (
-        "It sees the distribution of actions, not their order or their effect.",
-        "Maximum and minimum hang on one sample each: one glitch makes an outlier.",
-        "Good demonstrations of another style (slower, another hand) are outliers too.",
+        "It sees the distribution of actions, neither their order nor their effect.",
+        "Maximum and minimum depend on one sample each: one glitch makes an outlier.",
+        "Good demonstrations in another style (slower, another operator) are outliers as well.",
     ),
     "ensemble": (
-        "Raw, its parts are of different scales, so whichever varies more decides: often it is "
-        "one of the two with noise added. `standardised: true` needs a reference.",
-        "It inherits what its parts do not see.",
+        "The raw parts have different scales, so the one that varies more decides. Often the sum "
+        "is one part with noise added. `standardised: true` needs a reference.",
+        "What its parts miss, it misses as well.",
     ),
-    "knn": ("It compares statistics over time: the order of events is gone.",),
+    "knn": ("It compares statistics over time, so the order of events is lost.",),
     "trajectory_alignment": (
-        "States are not centred: the cosine of raw positions lies close to 1, and the columns of "
-        "the largest numbers (the height of the table) decide. Another origin is another score.",
+        "States are not centred. The cosine of raw positions is close to 1, and the columns with "
+        "the largest numbers (the height of the table) decide. The score depends on the origin.",
         "`of: time-mean` has no time axis: the same places in another order score the same.",
-        "`of: flattened` compares step by step, so that tempo counts as deviation.",
+        "`of: flattened` compares step by step, so a different pace counts as a deviation.",
     ),
     "length": (
-        "It is the confound itself: where failures run into the time limit it separates them "
-        "perfectly without seeing one. A scorer that it explains has shown nothing.",
+        "It is the confound itself. If failures run into the time limit, it separates them "
+        "perfectly without seeing one. A scorer that length explains has shown nothing.",
     ),
     "object_coupling": (
-        "It knows that the object came along, not that it came to the right place, nor that it "
-        "was the right one.",
-        "The effector's frame must lie between the fingers: from a flange, an object that turns "
-        "comes nearer or goes farther.",
-        "What slides slowly in the fingers (up to 4 mm a second of an exact pose, more of a noisy "
-        "one) is followed, and is a break only after 4 cm.",
-        "What is lost in the last two or three steps of TRANSPORT counts as put down.",
-        "What was opened early and held all the same (a finger that sticks) scores 1: that is "
-        "what happened, not what was commanded.",
-        "Of a simulator whose objects at rest repeat their pose to the last bit, an object that "
-        "was never touched looks like a tracker that has stopped: it abstains.",
+        "It knows that the object was carried. It knows neither whether that was the right object "
+        "nor whether it reached the right place.",
+        "The effector's frame must lie between the fingers. Seen from a flange, an object that "
+        "turns comes nearer or moves away.",
+        "An object that slides slowly in the fingers is followed, up to 4 mm per second with an "
+        "exact pose and more with a noisy one. The carry breaks only after 4 cm.",
+        "An object that is lost in the last two or three steps of TRANSPORT counts as put down.",
+        "An object that is still held after an early opening (a finger that sticks) scores 1. The "
+        "score is about what happened, not about what was commanded.",
+        "In a simulator, an object at rest may repeat its pose to the last bit. If it was never "
+        "touched, that looks like a tracker that has stopped: the scorer abstains.",
     ),
     "grip_consistency": (
-        "What is held may be anything: an object that is not the right one, or a finger's own "
-        "stop above the limit of an empty grip.",
+        "The fingers may hold anything: the wrong object, or their own mechanical stop if it lies "
+        "above the limit of an empty grip.",
         "Objects thinner than 2.5 % of the gripper's opening look like none.",
-        "On this simulator's early releases gap and effort show the command that opens, a little "
-        "later than the command itself: they are no independent evidence there.",
+        "On this simulator's early releases, gap and effort show the opening command, a little "
+        "later than the command itself. They are no independent evidence there.",
     ),
     "phase_events": (
-        "It detects early openings by construction and nothing else: a slipped object, an empty "
-        "grasp or a wrong place score as well as a success.",
-        "Phases come from whoever publishes them: a tracker that is wrong about the end of "
-        "TRANSPORT makes every opening early, or none.",
-        "With phases that a person's gripper defines it says nothing.",
+        "It detects early openings by construction and nothing else. A slipped object, an empty "
+        "grasp and a wrong place score like a success.",
+        "It trusts the publisher of the phases. If that is wrong about the end of TRANSPORT, "
+        "every opening is early, or none is.",
+        "If the phases are defined by the operator's gripper, it says nothing.",
     ),
 }
 #: What is true of a form that is fitted on a reference, and not of its twin.
 _OF_REFERENCE: dict[str, tuple[str, ...]] = {
     "isolation_forest": (
-        "A few references make few distinct depths: scores come in steps, and ties are common.",
+        "A few references give few distinct depths: scores come in steps, and ties are common.",
     ),
     "knn": (
-        "A copy of the episode in the reference under another id is its neighbour at distance 0; "
-        "so are, nearly, repetitions of one start.",
-        "Where the judged set differs from the reference in something harmless (another place "
-        "of the object), that distance counts as well.",
+        "A copy of the episode in the reference, under another id, is its neighbour at distance "
+        "0. Repetitions of one start are nearly so.",
+        "If the scored set differs from the reference in something harmless (another place of the "
+        "object), that distance counts as well.",
     ),
 }
 _TWINS = (
-    "It follows the majority: where most episodes are defective, the defect is typical and the "
-    "good ones rank last. Read it beside a scorer whose sign is anchored.",
-    "Starts are told apart by `same_start`: too small, and repetitions of one start vouch for "
-    "each other; too large, and everything is one start and it abstains.",
-    "With few different starts a large share of the dataset is left out for each episode.",
+    "It follows the majority. If most episodes are defective, the defect is typical and good "
+    "episodes rank last. Read it next to a scorer whose direction is fixed.",
+    "`same_start` separates starts. If it is too small, repetitions of one start count as "
+    "independent. If it is too large, there is only one start and the scorer abstains.",
+    "With few different starts, a large share of the dataset is left out for each episode.",
 )
 
-HEAD = """# Metrics: what each score means, needs, costs, and when it lies
+HEAD = """# Metrics: what each score means, needs and costs, and when it misleads
 
-Made by `docs/make_metrics.py` from the code; edit the docstrings, then run it.
+Made by `docs/make_metrics.py` from the code. To change it, edit the docstrings and run that.
 
-Higher is better for every score. A scorer that cannot score abstains with a reason. The seven of
-the paper are as it defines them; where its text leaves a choice open, the first word below is the
-default and the others are there as parameters (`scorer_params` of the configuration). SPARC
+Higher is better for every score. A scorer that cannot score abstains with a reason. The seven
+scorers of the paper follow its definitions. If its text leaves a choice open, the first value
+below is the default, and the others are parameters (`scorer_params` of the configuration). SPARC
 agrees to 1e-9 with the library of the authors of the measure (monalysa 0.2.1, on PyPI), on
-committed inputs and, where that is installed, on generated ones.
+committed inputs and, if that library is installed, on generated ones.
 
-A score says how an episode compares, never that it is good. What orients it is said for each:
-a scorer that nothing orients says only what is usual, and that turns over with the majority.
+A score shows how an episode compares, never that it is good. For each scorer this page names what
+orients it, that is, what makes one end of the scale the good end. A scorer without orientation
+only shows what is usual, and is inverted if the majority is bad.
+
+`curation scorers` lists these scorers and those of other packages.
+"""
+
+OWN_SCORER = """A scorer is a class with one method, `look`. Put it into a package of your own and
+offer it as an entry point; no file of this package changes. In `pyproject.toml`:
+
+```toml
+[project.entry-points."curation_ros.scorers"]
+pauses = "my_package.pauses:Pauses"
+```
+
+After `pip install`, `curation scorers` lists it, and configurations and commands accept its name.
+Derive the class from `curation_ros.core.scorers.Scorer`. This test shows what it must do:
+
+```python
+import pytest
+from curation_ros.testing.scorers import SCORER_RULES, check_scorer
+from my_package.pauses import Pauses
+
+
+@pytest.mark.parametrize("rule", SCORER_RULES)
+def test_pauses(rule):
+    check_scorer(Pauses, rules=[rule])
+```
+
+The rules:
 """
 
 
 def prose(doc: str) -> str:
-    """The paragraphs of a Google docstring before its first section, one a line."""
+    """The paragraphs of a Google docstring before its first section, one per line."""
     text = inspect.cleandoc(doc)
     text = re.split(r"^(?:Args|Attributes|Returns|Raises|Source):", text, maxsplit=1, flags=re.M)[
         0
@@ -209,7 +239,7 @@ def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 
 def costs() -> dict[str, str]:
-    """Scorer -> what an episode costs, as measured by benchmarks/scorer_cost.py."""
+    """Scorer -> cost per episode, as measured by benchmarks/scorer_cost.py."""
     rows = json.loads(RESULTS.read_text())["rows"] if RESULTS.exists() else []
     found = {}
     for row in rows:
@@ -217,7 +247,7 @@ def costs() -> dict[str, str]:
         if match:
             when = row.get("measured_at", "")
             found[match.group(1)] = (
-                f"{row['value']:.0f} µs an episode of {match.group(2)} steps, on one core "
+                f"{row['value']:.0f} µs per episode of {match.group(2)} steps, on one core "
                 f"(`{row['command']}`, {when})"
             )
     return found
@@ -251,7 +281,7 @@ def scorer_text(name: str, kind: type[Scorer], cost: dict[str, str]) -> str:
         else "",
         "Source",
     )
-    lies = LIES[twin] + (_OF_REFERENCE.get(name, ()) if name == twin else _TWINS)
+    misleads = MISLEADS[twin] + (_OF_REFERENCE.get(name, ()) if name == twin else _TWINS)
     score = kind._score_features if issubclass(kind, PoolScorer) else kind.look
     what, _, _ = (inspect.getdoc(score) or "").partition("\n\n")
     lines = [
@@ -265,26 +295,26 @@ def scorer_text(name: str, kind: type[Scorer], cost: dict[str, str]) -> str:
                 *([f"- **Source**: {source}"] if source else []),
                 f"- **Needs**: {needs}",
                 f"- **Oriented by**: {ORIENTS[scorer.needs]}",
-                f"- **Resolution**: {scorer.resolution:g} (differences below it count as none); "
+                f"- **Resolution**: {scorer.resolution:g} (smaller differences do not count); "
                 f"version {scorer.version}"
-                + ("" if scorer.length_controlled else "; never length-controlled"),
+                + ("" if scorer.length_controlled else "; always sees the whole episode"),
                 f"{_COST}{cost.get(name, 'not measured')}",
             ]
         ),
         parameters(scorer),
-        "When it lies:\n" + "\n".join(f"- {lie}" for lie in lies),
+        "When it misleads:\n" + "\n".join(f"- {text}" for text in misleads),
     ]
     return "\n\n".join(lines)
 
 
 def overview() -> str:
-    """One line a scorer."""
+    """One line per scorer."""
     rows = [
         (
             f"[{name}](#{name})",
             kind().needs,
             ORIENTS[kind().needs],
-            "yes" if name in DEFAULT_SCORERS else "when asked for",
+            "by default" if name in DEFAULT_SCORERS else "if named",
         )
         for name, kind in SCORERS.items()
     ]
@@ -312,27 +342,31 @@ def text(audit: str) -> str:
         overview(),
         "## Scorers",
         *(scorer_text(name, kind, cost) for name, kind in SCORERS.items()),
+        "## A scorer of your own",
+        OWN_SCORER.strip(),
+        "\n".join(f"- {rule}" for rule in SCORER_RULES),
         "## Length control",
-        "What every scorer but `length` sees of an episode (`length` and `length_value` of the "
-        "configuration). T never comes from labels.",
+        "The part of an episode that length-controlled scorers see (`length` and `length_value` "
+        "of the configuration). T never comes from labels.",
         table(("mode", "what is seen"), [(f"`{k}`", v) for k, v in MODES.items()]),
-        "An episode shorter than T stays whole. With `phase-normalised` every step is a recorded "
-        "one, the nearest, and only stamps are interpolated; a phase that an episode lacks is "
-        "absent, and without phases in the topic map every length-controlled scorer abstains.",
+        "An episode shorter than T stays whole. With `phase-normalised` every step is the nearest "
+        "recorded one, and only stamps are interpolated. A phase that an episode lacks is left "
+        "out. Without phases in the topic map every length-controlled scorer abstains.",
         "## Gripper",
-        "Its meaning is declared once, in the topic map, and refused where the data contradict it "
-        "(finding `gripper-meaning`): fingers that move against the declared sign; `binary` "
-        "commands of one sign only whose fingers follow both levels (0 only holds, so they could "
-        "never both open and close); `continuous` commands beyond the declared ends by more than "
-        "a tenth of their distance. A 0 that holds, fingers that do not move, and a glitch are "
-        "none.",
+        "The topic map declares the meaning of the gripper's command once. If the data contradict "
+        "it, the episode gets the finding `gripper-meaning`. These are contradictions:",
+        "- fingers that move against the declared sign\n"
+        "- `binary` commands of one sign only whose fingers follow both levels (0 holds the "
+        "previous command, so these could never both open and close)\n"
+        "- `continuous` commands beyond the declared ends by more than a tenth of their distance",
+        "A 0 that holds, fingers that do not move, and a glitch are no contradictions.",
         "## Findings",
         table(
             ("id", "kind", "meaning"),
             [(f"`{k}`", kinds[kind], meaning) for k, (kind, meaning) in FINDINGS.items()],
         ),
         "## Rules: from scores to verdicts and selections",
-        "`curation score --rule` decides on every episode, `curation select --rule` chooses among "
+        "`curation score --rule` decides on every episode. `curation select --rule` chooses among "
         "decided ones. A rule that both can use gives both the same answer for the same scored "
         "episodes.",
         table(("rule", "what it does"), [(f"`{k}`", v.summary) for k, v in RULES.items()]),
@@ -344,20 +378,20 @@ def text(audit: str) -> str:
 
 
 def audit_of(document: str) -> str:
-    """What a person wrote between the marks; an empty line where there is nothing yet."""
+    """The text between the marks, which is written by hand; an empty line if there is none."""
     before, begins, rest = document.partition(AUDIT_BEGINS)
     inside, ends, _ = rest.partition(AUDIT_ENDS)
     return inside if begins and ends and before else "\n"
 
 
 def unmeasured(document: str) -> str:
-    """The document without figures that differ from one measurement to the next."""
+    """The document without measured figures."""
     return re.sub(rf"^{re.escape(_COST)}.*$", _COST, document, flags=re.M)
 
 
 def main(arguments: list[str]) -> int:
-    """Write or check; 1 where the committed document is not current."""
-    assert set(LIES) == set(FORMULAS) == {n.removesuffix("_label_free") for n in SCORERS}
+    """Write or check; 1 if the committed document is not current."""
+    assert set(MISLEADS) == set(FORMULAS) == {n.removesuffix("_label_free") for n in SCORERS}
     assert set(ORIENTS) == set(get_args(Need))
     old = METRICS.read_text() if METRICS.exists() else ""
     new = text(audit_of(old))

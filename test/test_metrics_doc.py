@@ -1,4 +1,4 @@
-"""docs/metrics.md is what the code says."""
+"""docs/metrics.md agrees with the code."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 @pytest.fixture
 def generator(tmp_path: Path) -> ModuleType:
-    """The generator, with a copy of the document to work on."""
+    """The generator, with its own copy of the document."""
     spec = importlib.util.spec_from_file_location("make_metrics", _DOCS / "make_metrics.py")
     assert spec is not None
     assert spec.loader is not None
@@ -37,10 +37,10 @@ def test_document_has_every_scorer_parameter_mode_finding_and_rule(generator: Mo
     document = generator.METRICS.read_text()
     for name, kind in SCORERS.items():
         start = document.index(f"### {name}\n")
-        section = document[start : document.index("When it lies", start)]
+        section = document[start : document.index("When it misleads", start)]
         for parameter in kind().params():
             assert f"| `{parameter}` |" in section, (name, parameter)
-        assert "µs an episode of 350 steps" in section
+        assert "µs per episode of 350 steps" in section
     for name in (*MODES, *FINDINGS, *RULES):
         assert f"| `{name}` |" in document, name
     for name in RULES:
@@ -61,7 +61,7 @@ def test_check_finds_a_change_and_no_new_measurement(
     assert generator.main(["--check"]) == 0
 
 
-def test_what_a_person_wrote_on_the_audit_stays(generator: ModuleType) -> None:
+def test_text_on_the_audit_that_was_written_by_hand_stays(generator: ModuleType) -> None:
     before, begins, rest = generator.METRICS.read_text().partition(generator.AUDIT_BEGINS)
     ends = rest[rest.index(generator.AUDIT_ENDS) :]
     written = f"{before}{begins}\n\nWhat the columns mean.\n\n{ends}"

@@ -22,15 +22,16 @@ if TYPE_CHECKING:
 class Ensemble(Scorer):
     """Weighted sum of smoothness and gripper timing (the paper's 0.5 and 0.5).
 
-    The paper adds raw scores: smoothness (about -10 to -1.5) and timing (0 to 1) are of different
-    scales, so that with raw scores whichever varies more decides. `standardised=True` first
-    subtracts the mean and divides by the standard deviation of each in the reference, which it
-    then needs. The choices of the parts are theirs: `rate_hz`, `gripper_channel` of smoothness,
-    `on` of gripper timing. Abstains where either part does.
+    The paper adds raw scores. Smoothness (about -10 to -1.5) and timing (0 to 1) have different
+    scales, so the one that varies more decides. `standardised=True` subtracts the mean of each in
+    the reference and divides by its standard deviation. Then a reference is needed.
+
+    The parameters `rate_hz` and `gripper_channel` are those of smoothness, `on` is that of gripper
+    timing. Abstains if either part does.
 
     Attributes:
         mean_: (2,) mean of smoothness and timing in the reference; zeros if not standardised.
-        scale_: (2,) their standard deviation, at least their resolution; ones if not.
+        scale_: (2,) their standard deviation, at least their resolution; ones if not standardised.
     """
 
     needs: Need = "nothing"
@@ -52,10 +53,10 @@ class Ensemble(Scorer):
         Args:
             smoothness_weight: weight of smoothness.
             gripper_weight: weight of gripper timing.
-            standardised: whether the parts are standardised first.
-            rate_hz: sampling rate that smoothness assumes; 0: that of the episode.
-            gripper_channel: whether smoothness sees the command of the gripper.
-            on: what gripper timing reads.
+            standardised: whether the parts are standardised by the reference first.
+            rate_hz: sampling rate that smoothness assumes; 0 takes that of the episode.
+            gripper_channel: whether smoothness includes the command of the gripper.
+            on: what gripper timing reads, the command or the measured fingers.
         """
         self.smoothness_weight = smoothness_weight
         self.gripper_weight = gripper_weight
@@ -96,7 +97,7 @@ class Ensemble(Scorer):
         return self
 
     def look(self, episode: Episode) -> Look:
-        """The weighted sum, without unit."""
+        """The weighted sum, without a unit."""
         self.check_params()
         if self.standardised:
             self._check_fitted()

@@ -1,4 +1,4 @@
-"""Spread of the action: what the paper calls entropy."""
+"""Spread of the action, which the paper calls entropy."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 class Entropy(Scorer):
     """Negative standard deviation of the action sequence (the paper's 'entropy').
 
-    The paper does not say over what: `over='dimensions'` averages the standard deviation over
-    time of each action dimension, `over='values'` takes one of all numbers together. A binary
-    gripper dominates either; `gripper_channel=False` leaves it out. The deviation is that of the
+    The paper leaves open over what. `over='dimensions'` averages the standard deviations over time
+    of the action dimensions. `over='values'` takes one standard deviation of all numbers. A binary
+    gripper dominates both; `gripper_channel=False` leaves it out. The deviation is that of the
     population (divided by T).
     """
 
@@ -28,14 +28,15 @@ class Entropy(Scorer):
         """Store the parameters.
 
         Args:
-            over: whether deviations of dimensions are averaged, or one is taken of all values.
+            over: whether the deviations of the dimensions are averaged, or one is taken of all
+                values.
             gripper_channel: whether the command of the gripper is part of the action.
         """
         self.over = over
         self.gripper_channel = gripper_channel
 
     def look(self, episode: Episode) -> Look:
-        """0 for no spread, more negative for more; in the unit of the action."""
+        """0 for no spread, more negative for more spread; in the unit of the action."""
         self.check_params()
         action = moving_action(episode, gripper_channel=self.gripper_channel)
         spread = action.std(axis=0).mean() if self.over == "dimensions" else action.std()

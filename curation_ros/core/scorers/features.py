@@ -1,4 +1,4 @@
-"""What scorers read from an episode, with the reason to abstain where it cannot be read."""
+"""What scorers read from an episode, with the reason to abstain if it cannot be read."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _columns(episode: Episode, names: tuple[str, ...], what: str) -> Floats:
         raise Abstain(f"the {what} lacks the field {missing[0]!r}")
     topic_map = episode.topic_map
     if names == topic_map.action:
-        values = episode.action  # made once for all scorers
+        values = episode.action  # computed once for all scorers
     elif names == topic_map.state:
         values = episode.state
     else:
@@ -38,14 +38,14 @@ def _columns(episode: Episode, names: tuple[str, ...], what: str) -> Floats:
 
 
 def moving_action(episode: Episode, *, gripper_channel: bool = True) -> Floats:
-    """Actions of an episode in which something was commanded to move.
+    """Actions of an episode in which the robot was commanded to move.
 
     Args:
         episode: any episode.
-        gripper_channel: whether the command of the gripper stays in.
+        gripper_channel: whether the command of the gripper is included.
 
     Returns:
-        (T, A), T >= 2, finite, not the same row throughout.
+        (T, A) with T >= 2, finite, with at least two different rows.
 
     Raises:
         Abstain: if there are no such actions.
@@ -80,15 +80,15 @@ def reference_features(rows: Sequence[Floats], episodes: Sequence[Episode], leas
     """Features of reference episodes as one table.
 
     Args:
-        rows: one (F,) vector an episode.
+        rows: one (F,) vector per episode.
         episodes: the episodes, for messages.
-        least: smallest number of episodes that is of use.
+        least: smallest useful number of episodes.
 
     Returns:
         (n, F).
 
     Raises:
-        EpisodeError: if there are too few, or their widths differ.
+        EpisodeError: if there are too few episodes, or their widths differ.
     """
     if len(rows) < least:
         raise EpisodeError(f"the reference has {len(rows)} episodes, at least {least} are needed")
@@ -102,7 +102,7 @@ def reference_features(rows: Sequence[Floats], episodes: Sequence[Episode], leas
 
 
 def check_width(found: int, expected: int, what: str, of: str = "reference") -> None:
-    """Refuse an episode of another robot than that of the reference, or of the dataset.
+    """Abstain on an episode of another robot than that of the reference or dataset.
 
     Raises:
         Abstain: if the widths differ.
@@ -112,13 +112,14 @@ def check_width(found: int, expected: int, what: str, of: str = "reference") -> 
 
 
 def start_state(episode: Episode) -> Floats:
-    """Where an episode started, from its data: what repetitions of one start share.
+    """Where an episode started, from its data. Repetitions of one start share it.
 
     Returns:
-        (S,) first row of the fields with role object; where the map has none, of the effectors.
+        (S,) first row of the fields with role object, or of the effectors if the map has no
+        object.
 
     Raises:
-        Abstain: if there is no such field or row, or it is not finite.
+        Abstain: if there is no such field or row, or if it is not finite.
     """
     topic_map = episode.topic_map
     specs = topic_map.with_role("object") or topic_map.with_role("effector")
@@ -134,7 +135,7 @@ def start_state(episode: Episode) -> Floats:
 
 
 def phase_name(episode: Episode, step: int) -> str | None:
-    """Name of the phase at a step; None where it is unknown or the map has none."""
+    """Name of the phase at a step; None if it is unknown or the map has no phases."""
     phase, labels = episode.phase, episode.phase_labels
     if phase is None or not 0 <= phase[step] < len(labels):
         return None
@@ -142,11 +143,11 @@ def phase_name(episode: Episode, step: int) -> str | None:
 
 
 def checked_command(episode: Episode) -> npt.NDArray[np.int8]:
-    """(T,) what the gripper is commanded to be, as `gripper.commanded` has it, if it is sound.
+    """(T,) commanded state of the gripper, see `gripper.commanded`, if it can be trusted.
 
     Raises:
-        Abstain: if the episode has fewer than two steps, the command is missing, not finite, or
-            contradicts its declared meaning, or it never closes.
+        Abstain: if the episode has fewer than two steps, or the command is missing, not finite,
+            in contradiction to its declared meaning, or never closes.
     """
     if len(episode) < 2:
         raise Abstain(f"too short: the episode has {len(episode)} steps")

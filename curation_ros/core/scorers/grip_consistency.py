@@ -1,4 +1,4 @@
-"""Whether the fingers held something for as long as something was to be carried."""
+"""Whether the fingers held something while something was to be carried."""
 
 from __future__ import annotations
 
@@ -23,18 +23,22 @@ if TYPE_CHECKING:
 class GripConsistency(Scorer):
     """Share of the steps of LIFT and TRANSPORT in which the fingers held something.
 
-    For graphs without the pose of an object; evidence of the gripper, not of the object.
-    `on='fingers'`: the gap is neither closed (below 2.5 % of the widest opening so far) nor wider
-    by 5 % of it than at its narrowest since the grasp. `on='effort'`: the efforts of the fingers,
-    the field that `effort` names, still have a fifth of what they had at the grasp, and in its
-    direction; an empty grasp shows only where it is as good as without effort. Two steps in a row
-    make it sure.
+    It serves graphs without the pose of an object. It is evidence of the gripper, not of the
+    object.
 
-    Without these phases in the topic map, the time from half a second after a closing command to
-    the opening counts: it abstains then but for what slips out of the fingers.
+    `on='fingers'`: the fingers hold something while their gap is at least 2.5 % of the widest
+    opening so far, and no wider than at its narrowest since the grasp plus 5 % of that opening.
 
-    Abstains without fingers (or effort) in the topic map, and where the episode ends in
-    mid-carry. It looks at the whole episode, whatever the length control.
+    `on='effort'`: they hold something while their efforts, in the field that `effort` names, keep
+    a fifth of the value at the grasp, in its direction. An empty grasp is noticed only if it takes
+    next to no effort.
+
+    Two steps in a row without a grip make a loss certain. Without LIFT and TRANSPORT in the topic
+    map, a carry lasts from half a second after a closing command to the opening. Then only an
+    object that slips out of the fingers gets a score; for the others it abstains.
+
+    Abstains without fingers (or effort) in the topic map, and if the episode ends during a carry.
+    It always sees the whole episode.
     """
 
     needs = "nothing"
@@ -47,14 +51,14 @@ class GripConsistency(Scorer):
         """Store the parameters.
 
         Args:
-            on: what is read: the gap between the fingers, or their effort.
-            effort: the field with the efforts of the fingers, for `effort`.
+            on: what is read, the gap between the fingers or their effort.
+            effort: field with the efforts of the fingers, for `on: effort`.
         """
         self.on = on
         self.effort = effort
 
     def check_params(self) -> None:
-        """Check that effort has a field."""
+        """Check that there is a field for effort, and only for effort."""
         super().check_params()
         if (self.on == "effort") != bool(self.effort):
             raise ConfigError(
@@ -63,9 +67,9 @@ class GripConsistency(Scorer):
             )
 
     def look(self, episode: Episode) -> Look:
-        """1: held all the way; less: let go or closed on nothing at that share; 0: never held.
+        """1: held to the end; less: lost after that share of the carry; 0: never held.
 
-        The steps are the first one without a grip and the one that makes it sure.
+        The steps are the first one without a grip and the one that makes it certain.
         """
         self.check_params()
         checked_command(episode)
@@ -79,7 +83,7 @@ class GripConsistency(Scorer):
 
 
 def _explanation(episode: Episode, carrying: Carrying) -> str | None:
-    """When and where the fingers held nothing any more."""
+    """When and in which phase the fingers lost it."""
     hold = carrying.worst
     if hold is None or hold.departed is None:
         return None

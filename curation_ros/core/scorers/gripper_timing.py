@@ -1,4 +1,4 @@
-"""When the gripper opens again."""
+"""When the gripper opens after it was closed."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 class GripperTiming(Scorer):
     """Step of the first opening after a closing, over the number of steps (the paper's).
 
-    `on='command'` reads the command, `on='fingers'` the measured width (for hand-guided
-    demonstrations without a command). The paper does not say what an episode scores that never
-    opens again: `never='latest'` gives it 1.0, `never='abstain'` no score. Abstains if the gripper
-    never closed, and if the data contradict the meaning that the topic map declares.
+    `on='command'` reads the command. `on='fingers'` reads the measured width, for hand-guided
+    demonstrations without a command. The paper leaves open what an episode scores that never opens
+    again: `never='latest'` gives it 1.0, `never='abstain'` no score. Abstains if the gripper never
+    closed, and if the data contradict the meaning that the topic map declares.
 
-    It needs no reference; one only completes its sentence for the operator.
+    It needs no reference. With one, its explanation names the time at which trusted episodes open.
 
     Attributes:
-        earliest_opening_s_: earliest opening in the reference, seconds from the start; where none
-            opened, the end of the shortest one, until which all stayed closed.
+        earliest_opening_s_: earliest opening in the reference, in seconds from the start. If none
+            opened, the end of the shortest episode, until which all stayed closed.
     """
 
     needs = "nothing"
@@ -42,20 +42,20 @@ class GripperTiming(Scorer):
         """Store the parameters.
 
         Args:
-            on: whose opening counts, the command's or the measured fingers'.
-            never: what an episode scores that never opens again: 1 (`latest`) or nothing.
+            on: which opening counts, that of the command or that of the measured fingers.
+            never: score of an episode that never opens again: 1 (`latest`), or none (`abstain`).
         """
         self.on = on
         self.never = never
 
     def fit(self, episodes: Sequence[Episode]) -> Self:
-        """Learn when the reference opens; scores do not change."""
+        """Learn when the reference opens. This changes explanations, not scores."""
         self.check_params()
         opened, ended = [], []
         for episode in episodes:
             try:
                 step = self._opening(episode)
-            except Abstain:  # the rule that is fitted on our scores refuses it, by name
+            except Abstain:  # a rule that is fitted on these scores refuses the episode by name
                 continue
             ended.append(_seconds(episode, len(episode) - 1))
             if step is not None:
@@ -66,7 +66,7 @@ class GripperTiming(Scorer):
     def look(self, episode: Episode) -> Look:
         """From 0 (opened at once) to 1 (never opened again).
 
-        The step is that of the opening.
+        The step of the look is that of the opening.
         """
         step = self._opening(episode)
         if step is None:
@@ -77,7 +77,7 @@ class GripperTiming(Scorer):
         return Look(step / len(episode), steps=(step, step), explanation=explanation)
 
     def _explanation(self, episode: Episode, step: int) -> str:
-        """When and in which phase it opened, and when the reference does."""
+        """When and in which phase it opened, and when trusted episodes do."""
         opened_s, phase = _seconds(episode, step), phase_name(episode, step)
         text = f"the gripper opened at {opened_s:.1f} s" + (f", in {phase}" if phase else "")
         earliest_s: float | None = getattr(self, "earliest_opening_s_", None)

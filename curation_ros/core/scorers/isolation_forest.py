@@ -1,4 +1,4 @@
-"""How easily random splits isolate an episode from the others."""
+"""How easily random splits isolate an episode from others."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ _EULER_GAMMA = 0.5772156649015329
 
 
 class Forest(NamedTuple):
-    """Isolation trees as flat arrays: scored without scikit-learn, and hashable by content.
+    """Isolation trees as flat arrays, to be scored without scikit-learn and hashed by content.
 
-    The nodes of all trees stand one behind the other; children are indices into that.
+    The arrays hold the nodes of all trees, one tree after another. Children are indices into them.
 
     Attributes:
-        root: (trees,) where each tree begins.
-        feature: (nodes,) feature that a node splits on, 0 in a leaf.
-        threshold: (nodes,) go left where the feature is at most this.
+        root: (trees,) index of the first node of each tree.
+        feature: (nodes,) feature that a node splits on; 0 in a leaf.
+        threshold: (nodes,) a point goes left if its feature is at most this.
         left, right: (nodes,) children; a leaf is its own child.
         depth: (nodes,) expected depth of a point that ends in this leaf.
         levels: depth of the deepest tree.
-        normaliser: number that the summed depth is divided by.
+        normaliser: number that the sum of depths is divided by.
     """
 
     root: npt.NDArray[np.int64]
@@ -57,7 +57,7 @@ class Forest(NamedTuple):
 
 
 def _features(episode: Episode, of: str) -> Floats:
-    """(5 A,) mean, standard deviation, maximum, minimum and root mean square of each action."""
+    """(5 A,) mean, standard deviation, maximum, minimum and root mean square per dimension."""
     action = moving_action(episode)
     if of == "magnitudes":
         action = np.abs(action)
@@ -81,7 +81,7 @@ def _mean_search_length(n: Floats) -> Floats:
 
 def _grow(table: Floats, n_trees: int, max_samples: int, seed: int) -> Forest:
     """Grow a forest on (n, F) features, n >= 2."""
-    # Importing scikit-learn takes seconds: only who fits a forest waits for it.
+    # Importing scikit-learn takes seconds, which only a fit of a forest waits for.
     from sklearn import ensemble
 
     n_samples = min(max_samples, len(table))
@@ -120,11 +120,11 @@ def _grow(table: Floats, n_trees: int, max_samples: int, seed: int) -> Forest:
 class IsolationForest(Scorer):
     """Isolation forest on per-dimension statistics of the action (the paper's, fitted on clean).
 
-    'Action magnitudes per dimension' can be read in two ways: `of='signed'` takes the statistics
-    of the actions as they are, `of='magnitudes'` of their absolute values. scikit-learn grows the
-    trees; they are kept as flat arrays, so that one episode is scored in well under a
-    millisecond, and the fitted state can be hashed. The score is scikit-learn's `score_samples`:
-    between -1 (isolated at once) and 0.
+    'Action magnitudes per dimension' has two readings. `of='signed'` takes the statistics of the
+    actions as they are, `of='magnitudes'` those of their absolute values. scikit-learn grows the
+    trees. They are kept as flat arrays, so that a score takes well under a millisecond and the
+    fitted state can be hashed. The score is scikit-learn's `score_samples`, between -1 (isolated
+    by the first split) and 0.
 
     Attributes:
         forest_: the trees.
@@ -148,10 +148,10 @@ class IsolationForest(Scorer):
         """Store the parameters.
 
         Args:
-            n_trees: size of the forest.
-            max_samples: episodes drawn for a tree.
+            n_trees: number of trees.
+            max_samples: number of episodes that are drawn for a tree.
             seed: of the random splits.
-            of: what the statistics are taken of.
+            of: whether the statistics are those of signed actions or of their magnitudes.
         """
         self.n_trees = n_trees
         self.max_samples = max_samples
@@ -164,7 +164,7 @@ class IsolationForest(Scorer):
         _check_sizes(self)
 
     def fit(self, episodes: Sequence[Episode]) -> Self:
-        """Grow the trees; at least two reference episodes."""
+        """Grow the trees from at least two reference episodes."""
         self.check_params()
         try:
             rows = [_features(e, self.of) for e in episodes]
@@ -176,7 +176,7 @@ class IsolationForest(Scorer):
         return self
 
     def look(self, episode: Episode) -> Look:
-        """Between -1 and 0; an episode that nothing tells from the reference is near -0.4."""
+        """Between -1 and 0; near -0.4 for an episode like those of the reference."""
         self._check_fitted()
         row = _features(episode, self.of)
         check_width(len(row), self.n_features_, "features of the action")
@@ -186,11 +186,11 @@ class IsolationForest(Scorer):
 class LabelFreeIsolationForest(PoolScorer):
     """Isolation forest grown on the dataset itself, without the episodes of the same start.
 
-    Features and score as those of `isolation_forest`; one forest for each fold of starts.
+    Features and score are those of `isolation_forest`, with one forest per fold of starts.
 
     Attributes:
-        forests_: the forest grown outside each fold, and the last of all episodes; None where
-            fewer than two episodes are left.
+        forests_: the forest grown outside each fold; the last one is grown from all episodes. None
+            if fewer than two episodes are left.
     """
 
     resolution = 0.01
@@ -209,12 +209,12 @@ class LabelFreeIsolationForest(PoolScorer):
         """Store the parameters.
 
         Args:
-            n_trees: size of each forest.
-            max_samples: episodes drawn for a tree.
+            n_trees: number of trees of each forest.
+            max_samples: number of episodes that are drawn for a tree.
             seed: of the random splits.
-            of: what the statistics are taken of.
-            same_start: starts that differ by no more than this in any number are the same.
-            min_others: episodes of other starts that it takes to judge one.
+            of: whether the statistics are those of signed actions or of their magnitudes.
+            same_start: starts that differ by at most this in each number count as one start.
+            min_others: smallest number of episodes from other starts to compare with.
         """
         self.n_trees = n_trees
         self.max_samples = max_samples
@@ -240,7 +240,7 @@ class LabelFreeIsolationForest(PoolScorer):
         )
 
     def _score_features(self, features: Floats, model: int) -> float:
-        """Between -1 and 0; an episode that nothing tells from the others is near -0.4."""
+        """Between -1 and 0; near -0.4 for an episode like the others."""
         forest = self.forests_[model]
         assert forest is not None  # min_others >= 2
         return forest.score(features)

@@ -33,7 +33,7 @@ def _features(episode: Episode) -> Floats:
 
 
 def _scaling(table: Floats, scale_floor: float, standardised: bool) -> tuple[Floats, Floats]:
-    """(F,) mean and (F,) scale that features are standardised by; 0 and 1 if they are not."""
+    """(F,) mean and (F,) scale to standardise features by; 0 and 1 without standardisation."""
     if not standardised or not len(table):
         return np.zeros(table.shape[1]), np.ones(table.shape[1])
     return table.mean(axis=0), np.maximum(table.std(axis=0), scale_floor)
@@ -42,18 +42,17 @@ def _scaling(table: Floats, scale_floor: float, standardised: bool) -> tuple[Flo
 class NearestNeighbours(Scorer):
     """Negative mean distance to the k nearest reference episodes (the paper's 'kNN').
 
-    Features: mean, standard deviation and root mean square of each column of state and action.
-    The paper does not say whether they are scaled: by default each is standardised by the
-    reference, with `standardised=False` the columns of the largest unit decide. An episode is
-    never its own neighbour, by id. Where fewer than k others are left, `few='use'` takes those
-    there are (`describe` of the curation says how many the reference has) and `few='abstain'`
-    does not score.
+    Features are mean, standard deviation and root mean square of each column of state and action.
+    The paper leaves open whether they are scaled. By default each is standardised by the
+    reference; with `standardised=False` the columns with the largest numbers decide. An episode is
+    never its own neighbour, by id. If there are fewer than k others, `few='use'` takes all of
+    them, and `few='abstain'` gives no score.
 
     Attributes:
         ids_: ids of the reference episodes.
         mean_, scale_: (F,) mean and standard deviation of the features in the reference.
         table_: (n, F) standardised features of the reference.
-        k_: neighbours that an episode from outside the reference is compared with.
+        k_: number of neighbours for an episode that is not in the reference.
     """
 
     needs = "reference"
@@ -71,11 +70,11 @@ class NearestNeighbours(Scorer):
         """Store the parameters.
 
         Args:
-            k: neighbours to average over.
+            k: number of neighbours to average over.
             scale_floor: smallest standard deviation that a feature is divided by, in its own
-                unit; without it, columns that are constant in the reference (a settled object's
-                height) would decide alone.
-            few: what to do with fewer than k neighbours, `use` or `abstain`.
+                unit. Without it, columns that are constant in the reference (as the height of an
+                object at rest) would decide alone.
+            few: what to do with fewer than k neighbours, `use` them or `abstain`.
             standardised: whether features are divided by their standard deviation.
         """
         self.k = k
@@ -103,7 +102,7 @@ class NearestNeighbours(Scorer):
         return self
 
     def look(self, episode: Episode) -> Look:
-        """0 amid the reference, more negative further away; in standard deviations."""
+        """0 within the reference, more negative further away; in standard deviations."""
         self._check_fitted()
         row = _features(episode)
         check_width(len(row), len(self.mean_), "features of state and action")
@@ -117,13 +116,14 @@ class NearestNeighbours(Scorer):
 
 
 class LabelFreeNearestNeighbours(PoolScorer):
-    """Negative mean distance to the k nearest episodes of the dataset that started elsewhere.
+    """Negative mean distance to the k nearest episodes of the dataset from other starts.
 
-    Features as those of `knn`, standardised by the episodes outside the fold of the start; an
-    episode has at least `min_others` neighbours to choose from, and k or all of them count.
+    Features are those of `knn`, standardised by the episodes outside the fold of the start. The k
+    nearest of at least `min_others` episodes count, or all of them if there are fewer than k.
 
     Attributes:
-        mean_, scale_: (folds + 1, F) mean and standard deviation outside each fold, and of all.
+        mean_, scale_: (folds + 1, F) means and standard deviations outside each fold; the last
+            ones are those of all episodes.
         table_: (n, F) features of the dataset.
     """
 
@@ -141,11 +141,11 @@ class LabelFreeNearestNeighbours(PoolScorer):
         """Store the parameters.
 
         Args:
-            k: neighbours to average over.
+            k: number of neighbours to average over.
             scale_floor: smallest standard deviation that a feature is divided by.
             standardised: whether features are divided by their standard deviation.
-            same_start: starts that differ by no more than this in any number are the same.
-            min_others: episodes of other starts that it takes to judge one.
+            same_start: starts that differ by at most this in each number count as one start.
+            min_others: smallest number of episodes from other starts to compare with.
         """
         self.k = k
         self.scale_floor = scale_floor
@@ -170,12 +170,12 @@ class LabelFreeNearestNeighbours(PoolScorer):
         self.table_ = features
 
     def _score_features(self, features: Floats, model: int) -> float:
-        """0 amid the others, more negative further away; in standard deviations."""
-        # The mean cancels: only the scale is left in the difference of two standardised rows.
+        """0 within the others, more negative further away; in standard deviations."""
+        # In the difference of two standardised rows the mean cancels and only the scale is left.
         apart = self.table_ - features
         apart /= self.scale_[model]
         squared = np.einsum("ij,ij->i", apart, apart)
-        squared[self.fold_ == model] = np.inf  # the last model is no fold: all are others
+        squared[self.fold_ == model] = np.inf  # no episode, for the last model: it has no fold
         k = min(self.k, int(self.n_others_[model]))
         return -float(np.sqrt(np.sort(np.partition(squared, k - 1)[:k])).mean())
 

@@ -1,4 +1,4 @@
-"""Length alone: the baseline of the length confound."""
+"""Length alone: the baseline for the length confound."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 class Length(Scorer):
-    """Negative length: shorter is better. What it scores, a confounded scorer scores as well.
+    """Negative length: shorter is better. It shows what a scorer gains from length alone.
 
-    `of='steps'` counts steps, `of='path'` sums the way of the effector (the paper's 'cumulative
-    path'). It is never length-controlled: that would compare a constant.
+    `of='steps'` counts steps. `of='path'` sums the way of the effector (the paper's 'cumulative
+    path'). It is never length-controlled, as then all lengths would be equal.
     """
 
     needs = "nothing"
@@ -28,7 +28,7 @@ class Length(Scorer):
         """Store the parameters.
 
         Args:
-            of: what is measured: steps, or the path of the effector.
+            of: what is measured, steps or the path of the effector.
         """
         self.of = of
         self.resolution = 0.01 if of == "path" else 1.0
@@ -36,7 +36,7 @@ class Length(Scorer):
     def look(self, episode: Episode) -> Look:
         """Negative number of steps, or negative path in the unit of the effector."""
         self.check_params()
-        moving_action(episode)  # a recording that is broken or frozen has no meaningful length
+        moving_action(episode)  # a broken or frozen recording has no meaningful length
         if self.of == "steps":
             return Look(-float(len(episode)))
         effectors = episode.topic_map.with_role("effector")

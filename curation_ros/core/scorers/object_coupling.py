@@ -1,4 +1,4 @@
-"""Whether what was grasped stayed with the effector until it was let go."""
+"""Whether the grasped object stayed with the effector until it was released."""
 
 from __future__ import annotations
 
@@ -21,24 +21,26 @@ if TYPE_CHECKING:
 class ObjectCoupling(Scorer):
     """Share of the steps of LIFT and TRANSPORT in which the grasped object was carried.
 
-    The object is the one that is nearest to the effector at the grasp. It is carried as long as
-    its distance from the effector does not grow: an object that turns in the fingers (a bowl that
-    is held by its rim tilts by 2 to 3 cm) keeps that distance, one that falls or stays behind
-    does not. Growth beyond 15 mm and half the noise of the pose adds up from step to step, and
-    beyond 12 mm and four times that noise it is sure (a CUSUM test), beyond two thirds of that
-    after a command to open; the noise is measured on the object at rest before the grasp. The
-    reference follows slowly, so that an object may settle. What is opened in TRANSPORT and does
-    not fall was put down.
+    The object is the one nearest to the effector at the grasp. It counts as carried while its
+    distance from the effector does not grow. An object that turns in the fingers keeps that
+    distance; one that falls or stays behind does not. (A bowl that is held by its rim tilts by 2
+    to 3 cm.)
 
-    Without these phases in the topic map, the time from half a second after a closing command to
-    the opening counts: an early opening is then no break, as nobody says where the goal is, nor
-    whether anything was to be carried; it abstains but for what slips.
+    Growth beyond an allowance of 15 mm plus half the noise of the pose adds up from step to step
+    (a CUSUM test). The loss is certain when the sum exceeds 12 mm plus four times the noise; after
+    a command to open, two thirds of that suffice. The noise is measured on the object at rest
+    before the grasp. The reference distance follows slowly, so that an object may settle. An
+    object that is released in TRANSPORT and does not fall was put down.
 
-    Abstains, with what it could not know, where an object has no pose, its pose freezes or jumps
-    (to another object, perhaps), two objects are equally near, or the episode ends in mid-carry.
+    Without LIFT and TRANSPORT in the topic map, a carry lasts from half a second after a closing
+    command to the opening. Then an early opening is no loss, as the goal is unknown, and an empty
+    closing need not have been a grasp. Only an object that slips gets a score; for the others it
+    abstains.
 
-    It looks at the whole episode, whatever the length control: what follows after TRANSPORT does
-    not change it.
+    Abstains, with the reason, if an object has no pose, its pose freezes or jumps (perhaps to
+    another object), two objects are equally near, or the episode ends during a carry.
+
+    It always sees the whole episode. Steps after TRANSPORT do not change the score.
     """
 
     needs = "object pose"
@@ -47,9 +49,9 @@ class ObjectCoupling(Scorer):
     version = 2
 
     def look(self, episode: Episode) -> Look:
-        """1: carried all the way; less: it left at that share of the way; 0: never carried.
+        """1: carried to the end; less: it left after that share of the carry; 0: never carried.
 
-        The steps run from the first one of leaving to the one that makes it sure.
+        The steps run from the first one of leaving to the one that makes it certain.
         """
         if episode.topic_map.gripper is not None:
             checked_command(episode)
@@ -79,10 +81,10 @@ def _explanation(episode: Episode, carrying: Carrying) -> str | None:
 
 
 def known(episode: Episode, carrying: Carrying) -> Carrying:
-    """What became of what was grasped, if that is known.
+    """The carrying of an episode, if its outcome is known.
 
     Raises:
-        Abstain: with the reason, if it is not.
+        Abstain: with the reason, if it is not known.
     """
     worst = carrying.worst
     if worst is None or worst.state == "unknown":
@@ -97,11 +99,11 @@ def known(episode: Episode, carrying: Carrying) -> Carrying:
 
 
 def opened_too_early(episode: Episode, carrying: Carrying) -> int | None:
-    """Step at which a hold began to break by a command to open; None where none broke so.
+    """Step at which a hold began to break because of a command to open; None if none did.
 
-    A noisy pose may seem to leave a little before that command, or after it: the earlier of the
-    two counts. What slips out of closed fingers may have been grasped badly: how far back the
-    episode is bad then, nobody knows.
+    With a noisy pose the object may seem to leave a little before the command or after it. The
+    earlier of the two steps counts. An object that slips out of closed fingers may have been
+    grasped badly. Then it is unknown from which step on the episode is bad, so there is no step.
     """
     hold = carrying.worst
     if hold is None or hold.state != "broken" or hold.departed is None or hold.noticed is None:
@@ -115,7 +117,7 @@ def opened_too_early(episode: Episode, carrying: Carrying) -> int | None:
 
 
 def lost_steps(carrying: Carrying) -> tuple[int, int] | None:
-    """First step of the loss and the one that makes it sure, of the hold that decides."""
+    """First step of the loss and the one that makes it certain, of the hold that decides."""
     hold: Hold | None = carrying.worst
     if hold is None or hold.departed is None or hold.noticed is None:
         return None
@@ -123,5 +125,5 @@ def lost_steps(carrying: Carrying) -> tuple[int, int] | None:
 
 
 def seconds(episode: Episode, step: int) -> float:
-    """Time of a step from the start of the episode."""
+    """Seconds from the start of the episode to a step."""
     return (int(episode.stamps_ns[step]) - episode.start_ns) / NS_PER_S

@@ -1,4 +1,4 @@
-"""When the gripper was opened within the phases in which it must not be."""
+"""When the gripper was opened within phases in which it must stay closed."""
 
 from __future__ import annotations
 
@@ -17,17 +17,16 @@ if TYPE_CHECKING:
 
 
 class PhaseEvents(Scorer):
-    """How far LIFT and TRANSPORT had come when the gripper was commanded to open: the worst.
+    """How much of LIFT or TRANSPORT was done when the gripper was commanded to open.
 
-    For graphs that have phases and no objects. Each of these phases counts by its own progress,
-    the share of its steps before the first one that is commanded open, 1 if there is none; a
-    phase that begins open because an earlier one was left open has no event of its own and counts
-    1. The phases are put together by the worst, softly: -s ln(mean(exp(-v / s))) with
-    s = `softness`. A mean of ranks over phases would dilute what shows in one of them alone.
+    It serves graphs with phases and without objects. Each of the two phases counts by the share of
+    its steps before the first one that is commanded open; 1 if there is none. A phase that begins
+    open because the one before it ended open counts 1, as it has no opening of its own. The worst
+    phase decides, by a soft minimum: -s ln(mean(exp(-v / s))) with s = `softness`. A mean over
+    phases would dilute an opening that only one of them shows.
 
-    It sees commands and no consequence. Abstains without these phases, where the episode never
-    came to one of them, and where it ends in one of them. It looks at the whole episode, whatever
-    the length control.
+    It sees commands, not their effect. Abstains without these phases, if the episode never reached
+    one of them, and if it ends in one of them. It always sees the whole episode.
     """
 
     needs = "nothing"
@@ -38,7 +37,7 @@ class PhaseEvents(Scorer):
         """Store the parameters.
 
         Args:
-            softness: how much a second phase counts beside the worst; above 0.
+            softness: how much the second phase counts next to the worst; above 0.
         """
         self.softness = softness
 
@@ -49,9 +48,10 @@ class PhaseEvents(Scorer):
             raise ConfigError(f"PhaseEvents: expected softness > 0, found {self.softness}")
 
     def look(self, episode: Episode) -> Look:
-        """1: not opened in any of them; towards 0 the earlier it was opened in the worst.
+        """1: not opened in either phase; towards 0 the earlier it was opened in the worst one.
 
-        The step is that of the opening in the worst phase; it broke at the first one in any.
+        The step is that of the opening in the worst phase. The episode broke at the first opening
+        in any phase.
         """
         events = self._events(episode)
         shares = np.array([share for share, _ in events.values()])
@@ -71,7 +71,7 @@ class PhaseEvents(Scorer):
         )
 
     def _events(self, episode: Episode) -> dict[str, tuple[float, int | None]]:
-        """Phase -> share of it before the opening, and the step of that."""
+        """Phase -> share of its steps before the opening, and the step of the opening."""
         self.check_params()
         is_open = checked_command(episode) > 0
         labels, phase = carry_labels(episode.topic_map), episode.phase

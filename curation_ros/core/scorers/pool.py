@@ -21,29 +21,29 @@ if TYPE_CHECKING:
     from curation_ros.core.episode.episode import Episode
     from curation_ros.core.types import Floats
 
-#: Models that are learned beside the one of all episodes: more cost time and memory.
+#: Number of models in addition to that of all episodes. More would cost time and memory.
 MAX_FOLDS = 20
 
 
 class PoolScorer(Scorer):
-    """A label-free twin: judges an episode by the other episodes of its dataset.
+    """A label-free twin: compares an episode with the other episodes of its dataset.
 
-    Datasets are recorded in repetitions of one start, and a repetition is nearly a copy: among
-    its own repetitions every episode looks typical. Starts closer than `same_start` are one
-    group, groups are spread over at most MAX_FOLDS folds, and all that an episode is judged by
-    is learned outside the fold of its start. An episode of a start that the dataset lacks is
-    judged by all.
+    Datasets are recorded in repetitions of one start. A repetition is nearly a copy, so every
+    episode looks typical among its own repetitions. Starts closer than `same_start` form a group,
+    and groups are spread over at most MAX_FOLDS folds. An episode is compared with what was
+    learned outside the fold of its start. An episode from a start that the dataset lacks is
+    compared with all.
 
-    Invariant: a score depends on the rows of the other folds alone: neither on the order of the
-    dataset, nor on ids, nor on a copy of the episode that was recorded from the same start.
+    Invariant: a score depends on the rows of the other folds alone. It depends neither on the
+    order of the dataset, nor on ids, nor on another recording from the same start.
 
-    Without labels nothing says which mode of the data is the good one: the score follows the
-    majority, and turns over where defects are the majority.
+    Without labels nothing shows which mode of the data is the good one. The score follows the
+    majority, so it is inverted if most episodes are defective.
 
     Attributes:
         starts_: (n, S) starts of the episodes, sorted.
-        fold_: (n,) fold of each.
-        n_others_: (folds + 1,) episodes outside each fold; the last: all.
+        fold_: (n,) fold of each episode.
+        n_others_: (folds + 1,) number of episodes outside each fold; the last counts all.
         n_features_: width of the features.
     """
 
@@ -53,7 +53,7 @@ class PoolScorer(Scorer):
 
     @abstractmethod
     def _features(self, episode: Episode) -> Floats:
-        """(F,) what the episode is judged by.
+        """(F,) features that the episode is compared by.
 
         Raises:
             Abstain: if it cannot be read.
@@ -61,7 +61,7 @@ class PoolScorer(Scorer):
 
     @abstractmethod
     def _learn(self, features: Floats, fold: npt.NDArray[np.int64]) -> None:
-        """Learn a model outside each fold and one of all, from (n, F) features."""
+        """Learn a model outside each fold and one of all episodes, from (n, F) features."""
 
     @abstractmethod
     def _score_features(self, features: Floats, model: int) -> float:
@@ -77,7 +77,7 @@ class PoolScorer(Scorer):
             )
 
     def summary(self, episode: Episode) -> Floats:
-        """All that `fit_summaries` needs of one episode, so that none has to stay in memory.
+        """What `fit_summaries` needs of one episode, so that no episode must stay in memory.
 
         Returns:
             (1 + S + F,) the width of the start, the start, the features.
@@ -94,14 +94,14 @@ class PoolScorer(Scorer):
         """Learn from all episodes of the dataset; those that cannot be used are skipped.
 
         Raises:
-            EpisodeError: if fewer than `min_others` are left, or an id is there twice.
+            EpisodeError: if fewer than `min_others` are left, or two have the same id.
         """
         self.check_params()
         ids, rows = [], []
         for episode in episodes:
             try:
                 row = self.summary(episode)
-            except Abstain:  # it will abstain when it is scored, with the reason
+            except Abstain:  # its look will abstain as well, with the reason
                 continue
             ids.append(episode.id)
             rows.append(row)
@@ -110,14 +110,14 @@ class PoolScorer(Scorer):
     def fit_summaries(self, ids: Sequence[str], rows: Sequence[Floats]) -> Self:
         """Learn from what `summary` returned for the episodes of the dataset.
 
-        Rows of another width than most have (another robot) are skipped.
+        Rows whose width differs from that of most rows (another robot) are skipped.
 
         Args:
-            ids: one an episode, for messages.
-            rows: one an episode, in any order.
+            ids: one per episode, for messages.
+            rows: one per episode, in any order.
 
         Raises:
-            EpisodeError: if fewer than `min_others` are left, or an id is there twice.
+            EpisodeError: if fewer than `min_others` are left, or two have the same id.
         """
         self.check_params()
         twice = [i for i, n in Counter(ids).items() if n > 1]
@@ -131,7 +131,7 @@ class PoolScorer(Scorer):
                 f"the dataset has {len(used)} episodes that can be used, at least "
                 f"{self.min_others} are needed"
             )
-        # Sorted by content, so that the order of the dataset does not reach the last bits.
+        # Sorted by content, so that the order of the dataset does not change the last bits.
         table = np.array(used)
         table = table[np.lexsort(table.T[::-1])]
         n_start = usual[1]
@@ -145,7 +145,7 @@ class PoolScorer(Scorer):
         return self
 
     def look(self, episode: Episode) -> Look:
-        """Score one episode by the dataset without its start."""
+        """Score one episode by the episodes of the dataset from other starts."""
         self._check_fitted()
         features = self._features(episode)
         check_width(len(features), self.n_features_, "features", of="dataset")
@@ -171,13 +171,13 @@ class PoolScorer(Scorer):
 
 
 def outside(fold: npt.NDArray[np.int64]) -> list[npt.NDArray[np.bool_]]:
-    """(n,) masks of the episodes that each model learns from: outside each fold, and all."""
+    """(n,) masks of the episodes that each model learns from: outside each fold, then all."""
     masks = [fold != k for k in range(int(fold.max()) + 1)]
     return [*masks, np.ones(len(fold), dtype=bool)]
 
 
 def _groups(starts: Floats, same_start: float) -> npt.NDArray[np.int64]:
-    """(n,) group of each start: chains of starts that are each closer than `same_start`."""
+    """(n,) group of each start. A group is a chain of starts, each near to the next one."""
     group = np.full(len(starts), -1, dtype=np.int64)
     n_groups = 0
     for seed in range(len(starts)):
@@ -196,8 +196,8 @@ def _groups(starts: Floats, same_start: float) -> npt.NDArray[np.int64]:
 
 
 def _folds(group: npt.NDArray[np.int64], starts: Floats) -> npt.NDArray[np.int64]:
-    """(n,) fold of each start; by rank of a hash, so that the folds are equally many groups."""
-    _, first = np.unique(group, return_index=True)  # starts are sorted: the smallest of its group
+    """(n,) fold of each start, by the rank of a hash: all folds have equally many groups."""
+    _, first = np.unique(group, return_index=True)  # the smallest start of each group
     hashes = [hashlib.sha256(starts[k].astype("<f8").tobytes()).digest() for k in first]
     rank = np.empty(len(hashes), dtype=np.int64)
     rank[sorted(range(len(hashes)), key=hashes.__getitem__)] = np.arange(len(hashes))

@@ -1,4 +1,4 @@
-"""What a scorer is: scikit-learn's contract, on episodes."""
+"""What a scorer is: the contract of scikit-learn's estimators, for episodes."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
     from curation_ros.core.episode.episode import Episode
 
-#: What orients a score; `dataset`: the unlabelled dataset itself, which only says what is usual.
+#: What orients a score. `dataset` is the unlabelled dataset, which only shows what is usual.
 Need = Literal["nothing", "reference", "dataset", "object pose", "rollouts", "labels"]
 
 
-class Abstain(EpisodeError):  # noqa: N818 - an answer of a scorer rather than a fault
+class Abstain(EpisodeError):  # noqa: N818 - an answer rather than an error
     """A scorer cannot score this episode; the message is the short reason."""
 
 
@@ -51,14 +51,15 @@ class Scorer(ABC):
     changes neither. Labels have no way in: no method has an argument for them.
 
     Attributes:
-        needs: what orients the score. Of an instance it may differ from its class (`ensemble`).
-        length_controlled: whether the episode is to be length-controlled before it comes here;
-            false for the baseline of length, and for a scorer that looks at certain phases alone:
-            it is to see all of them, and what follows does not change it.
-        resolution: difference in score below which two episodes count as equal; the margin of a
-            threshold fitted on references whose scores are all the same.
-        version: raised whenever the definition changes, so that old scores are not mixed in.
-        choices: hyper-parameters that are one of a few words, and the words.
+        needs: what orients the score. An instance may differ from its class (`ensemble`).
+        length_controlled: whether the episode is length-controlled before a look. False for the
+            baseline of length. False also for scorers of certain phases: they need all of these
+            phases, and later steps do not change them.
+        resolution: scores that differ by less count as equal. It is also the margin of a
+            threshold that was fitted on references with equal scores.
+        version: raised with each change of the definition, so that old and new scores are never
+            mixed.
+        choices: hyper-parameter -> its allowed values, for those that take one of a few words.
     """
 
     needs: Need = "nothing"
@@ -68,11 +69,11 @@ class Scorer(ABC):
     choices: ClassVar[Mapping[str, tuple[str, ...]]] = {}
 
     def fit(self, episodes: Sequence[Episode]) -> Self:
-        """Learn from trusted reference episodes; a scorer that needs nothing learns nothing.
+        """Learn from trusted reference episodes. A scorer that needs nothing learns nothing.
 
         Args:
-            episodes: the reference, length-controlled as the scored episodes will be. Their order
-                may change the last bits of what is learned: sort them.
+            episodes: the reference, length-controlled like the episodes to score. Their order may
+                change the last bits of what is learned, so callers sort them.
 
         Raises:
             EpisodeError: if there are too few, or one of them cannot be used.
@@ -99,20 +100,20 @@ class Scorer(ABC):
         return self.look(episode).score
 
     def check_params(self) -> None:
-        """Check the hyper-parameters; not done on construction, as scikit-learn has it.
+        """Check the hyper-parameters. As in scikit-learn, construction does not check them.
 
         Raises:
             ConfigError: naming the parameter, what was found and what was expected.
         """
-        for name, words in self.choices.items():
-            if getattr(self, name) not in words:
+        for name, values in self.choices.items():
+            if getattr(self, name) not in values:
                 raise ConfigError(
                     f"{type(self).__name__}: {name} is {getattr(self, name)!r}, "
-                    f"expected one of {', '.join(words)}"
+                    f"expected one of {', '.join(values)}"
                 )
 
     def params(self) -> dict[str, Any]:
-        """Hyper-parameters by name, as they were given."""
+        """Hyper-parameters by name, as given."""
         parameters = inspect.signature(type(self).__init__).parameters.values()
         names = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
         return {name: getattr(self, name) for name in names}

@@ -29,21 +29,21 @@ def spectral_arc_length(
     Args:
         speed: (T,) not negative, not all zero, T >= 1.
         rate_hz: sampling rate of `speed`.
-        cutoff_hz: frequencies above it are ignored; lowered to half the rate where it exceeds it.
+        cutoff_hz: frequencies above it are ignored; at most half the rate is used.
         threshold: the band ends at the last frequency with this share of the largest amplitude.
-        pad_level: the spectrum is taken over 2**(ceil(log2(T)) + pad_level) points.
+        pad_level: the spectrum has 2**(ceil(log2(T)) + pad_level) points.
 
     Returns:
-        The negative arc length of the normalised amplitude spectrum, no unit.
+        The negative arc length of the normalised amplitude spectrum, without a unit.
 
     Raises:
         Abstain: if the rate is not positive, or the speed is zero throughout.
 
     Source: Balasubramanian, Melendez-Calderon, Burdet, IEEE TBME 59(8), 2012, with the adaptive
     cut-off of Balasubramanian et al., J. NeuroEngineering and Rehabilitation 12:112, 2015.
-    Differences: the cut-off is limited to half the rate. The authors' own code (monalysa) takes
-    the whole FFT, so that with a cut-off above half the rate it goes on into the mirror image of
-    the spectrum; below that the two agree to rounding.
+    Differences: the cut-off is limited to half the rate. The authors' code (monalysa) takes the
+    whole FFT, so a cut-off above half the rate includes the mirror image of the spectrum. Below
+    half the rate the two agree to rounding.
     """
     if not (np.isfinite(rate_hz) and rate_hz > 0):
         raise Abstain(f"the rate of the clock is {rate_hz} Hz")
@@ -64,12 +64,14 @@ def spectral_arc_length(
 class Smoothness(Scorer):
     """Spectral arc length of the norm of the action over time (the paper's 'smoothness').
 
-    The paper names neither rate, cut-off nor threshold: the rate is by default the episode's own,
-    the others are those of the authors of the measure. `rate_hz` gives one rate to all; at 1 Hz,
-    the default of the paper's released library, the cut-off never applies. The norm of an action
-    is a speed where actions are velocities; for commanded positions `profile='change'` takes the
-    norm of their differences. With a binary gripper in the action its constant 1 dominates the
-    norm: the paper's definition, kept as the default; `gripper_channel=False` leaves it out.
+    The paper names neither rate, cut-off nor threshold. By default the rate is that of the
+    episode, and the others are those of the authors of the measure. `rate_hz` sets one rate for
+    all episodes. At 1 Hz, the default of the paper's released library, the cut-off never applies.
+
+    The norm of an action is a speed if actions are velocities. For commanded positions,
+    `profile='change'` takes the norm of their differences. With a binary gripper in the action,
+    its constant 1 dominates the norm. That is the paper's definition and the default;
+    `gripper_channel=False` leaves it out.
     """
 
     needs = "nothing"
@@ -89,11 +91,11 @@ class Smoothness(Scorer):
         """Store the parameters.
 
         Args:
-            rate_hz: sampling rate that is assumed; 0: that of the episode.
+            rate_hz: sampling rate that is assumed; 0 takes that of the episode.
             cutoff_hz: frequencies above it are ignored.
             threshold: the band ends at the last frequency with this share of the largest.
-            pad_level: doublings of the points of the spectrum.
-            profile: of what the spectrum is: `norm` of the action, or of its `change`.
+            pad_level: how many times the number of points of the spectrum is doubled.
+            profile: whose spectrum is taken: `norm` of the action, or norm of its `change`.
             gripper_channel: whether the command of the gripper is part of the action.
         """
         self.rate_hz = rate_hz

@@ -1,4 +1,4 @@
-"""Likeness of the motion to the mean motion of others."""
+"""Similarity of the motion to the mean motion of other episodes."""
 
 from __future__ import annotations
 
@@ -33,19 +33,20 @@ def _cosine(a: Floats, b: Floats) -> float:
 
 
 def _moving_state(episode: Episode) -> Floats:
-    moving_action(episode)  # a frozen episode is to be looked at, not to be compared
+    moving_action(episode)  # abstains on a frozen episode: there is no motion to compare
     return finite_state(episode)
 
 
 class TrajectoryAlignment(Scorer):
     """Cosine of the angle between an episode's states and the reference's mean (the paper's).
 
-    'Mean state trajectory' can be read in two ways: `of='time-mean'` compares the mean over time
-    of the states (S numbers), which is what the paper's code does; `of='flattened'` compares
-    whole trajectories (T times S numbers) step by step, over the steps that both have.
+    'Mean state trajectory' has two readings. `of='time-mean'` compares the means over time of the
+    states (S numbers), as the paper's code does. `of='flattened'` compares whole trajectories
+    (T times S numbers) step by step, over the steps that both have.
 
     Attributes:
-        mean_: (1, S), or (T, S) with `of='flattened'`, T the shortest reference episode.
+        mean_: (1, S), or (T, S) with `of='flattened'`, where T is the length of the shortest
+            reference episode.
     """
 
     needs = "reference"
@@ -56,7 +57,7 @@ class TrajectoryAlignment(Scorer):
         """Store the parameters.
 
         Args:
-            of: what is compared: the mean over time of the states, or all of them in a row.
+            of: what is compared, the mean over time of the states or all states in a row.
         """
         self.of = of
 
@@ -87,13 +88,13 @@ class TrajectoryAlignment(Scorer):
 
 
 class LabelFreeTrajectoryAlignment(PoolScorer):
-    """Cosine of the angle between an episode's states and the mean of all from other starts.
+    """Cosine of the angle between an episode's states and the mean of those from other starts.
 
-    `of='time-mean'` as in `trajectory_alignment`; `of='flattened'` compares the states at
-    `n_points` evenly spaced steps, so that what is kept of an episode does not grow with it.
+    `of='time-mean'` is as in `trajectory_alignment`. `of='flattened'` compares the states at
+    `n_points` evenly spaced steps, so that the memory per episode does not depend on its length.
 
     Attributes:
-        mean_: (folds + 1, F) mean outside each fold, and of all.
+        mean_: (folds + 1, F) means outside each fold; the last one is that of all episodes.
     """
 
     resolution = 0.001
@@ -110,10 +111,10 @@ class LabelFreeTrajectoryAlignment(PoolScorer):
         """Store the parameters.
 
         Args:
-            of: what is compared: the mean over time of the states, or some of them in a row.
-            n_points: steps that are compared with `of='flattened'`.
-            same_start: starts that differ by no more than this in any number are the same.
-            min_others: episodes of other starts that it takes to judge one.
+            of: what is compared, the mean over time of the states or some of them in a row.
+            n_points: number of steps that are compared with `of: flattened`.
+            same_start: starts that differ by at most this in each number count as one start.
+            min_others: smallest number of episodes from other starts to compare with.
         """
         self.of = of
         self.n_points = n_points
