@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from curation_ros.core.episode.arrays import (
+    clock_stamps,
+    draft_topic_map,
+    join_arrays,
+    n_rows,
+)
 from curation_ros.core.episode.findings import Finding
+from curation_ros.core.episode.identity import foreign_episode_id
+from curation_ros.core.episode.joining import Window
 from curation_ros.core.episode.stream import Stamps
 from curation_ros.core.episode.topic_map import AT_START, TopicMap
 from curation_ros.core.errors import EpisodeError
@@ -31,8 +40,8 @@ class Episode:
         fields: name -> (T, D) float64; a phase is the index of its name in the map, -1 unknown.
         topic_map: the meaning of the fields.
         findings: faults of the recording, in a stable order.
-        sampled_hz: rate of the recording where the steps are a selection that no longer shows it
-            (length control); None where the stamps show it.
+        sampled_hz: rate of the recording if the steps are a selection that no longer shows it
+            (length control); None if the stamps show it.
     """
 
     id: str
@@ -45,8 +54,67 @@ class Episode:
     findings: tuple[Finding, ...] = ()
     sampled_hz: float | None = None
 
+    @classmethod
+    def from_arrays(
+        cls,
+        fields: Mapping[str, npt.ArrayLike],
+        meaning: Mapping[str, str] | TopicMap,
+        *,
+        stamps_ns: npt.ArrayLike | None = None,
+        rate_hz: float | None = None,
+        phases: Sequence[str] = (),
+        gripper: Mapping[str, object] | None = None,
+        name: str = "",
+        episode_id: str = "",
+        window: Window | None = None,
+        findings: Sequence[Finding] = (),
+    ) -> Episode:
+        """Make an episode of arrays that never were in a bag; faults are found as in a bag.
+
+        Args:
+            fields: name -> (T, D) or (T,) numbers. A phase has (T,) labels, or their indices.
+            meaning: role of each field, such as `effector` or `action`, from which a topic map is
+                drafted (`draft_topic_map`); or the topic map, which has exactly these fields.
+            stamps_ns: (T,) integers, nanoseconds. Exclusive with `rate_hz`.
+            rate_hz: steps per second, for arrays without stamps.
+            phases: names of the phases in their order, for a drafted map.
+            gripper: what the numbers of the gripper mean, for a drafted map.
+            name: short name for people.
+            episode_id: identity; by default derived from the content.
+            window: first and last stamp of the episode; by default those of the arrays.
+            findings: faults that the arrays do not show.
+
+        Raises:
+            ConfigError: if the roles do not make a topic map.
+            EpisodeError: if the arrays do not fit the map or the stamps.
+
+        Example:
+            >>> hand = np.linspace([0.0, 0.0, 1.0], [0.3, 0.1, 1.2], 40)
+            >>> fields = {"hand": hand, "velocity": np.gradient(hand, axis=0)}
+            >>> roles = {"hand": "effector", "velocity": "action"}
+            >>> Episode.from_arrays(fields, roles, rate_hz=20.0, name="by-hand")
+            Episode(by-hand, T=40, hand 3, velocity 3)
+        """
+        if not isinstance(meaning, TopicMap):
+            meaning = draft_topic_map(fields, meaning, phases=phases, gripper=gripper)
+        stamps = clock_stamps(n_rows(fields), stamps_ns, rate_hz, window)
+        if window is None:
+            window = (int(stamps.min()), int(stamps.max())) if len(stamps) else (0, 0)
+        joined = join_arrays(fields, meaning, stamps, window, findings)
+        episode = cls(
+            episode_id,
+            name,
+            *window,
+            stamps_ns=joined.stamps_ns,
+            fields=joined.fields,
+            topic_map=meaning,
+            findings=joined.findings,
+        )
+        derived_id = foreign_episode_id(episode.content_digest, window[0])
+        return episode if episode_id else replace(episode, id=derived_id)
+
     def __getstate__(self) -> dict[str, Any]:
-        # What is cached is made again where it is needed: it must not travel to other processes.
+        # Cached values are computed again where they are needed, and do not travel to workers.
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def __len__(self) -> int:
@@ -81,13 +149,13 @@ class Episode:
 
     @property
     def phase(self) -> Floats | None:
-        """(T,) index of the phase, -1 unknown; None where the map has no phase."""
+        """(T,) index of the phase, -1 unknown; None if the map has no phase."""
         specs = self.topic_map.with_role("phase")
         return self.fields[specs[0].name][:, 0] if specs else None
 
     @property
     def phase_labels(self) -> tuple[str, ...]:
-        """Names of the phases in their order; empty where the map has no phase."""
+        """Names of the phases in their order; empty if the map has no phase."""
         specs = self.topic_map.with_role("phase")
         return specs[0].labels if specs else ()
 
@@ -118,12 +186,12 @@ class Episode:
 
     @cached_property
     def state(self) -> Floats:
-        """(T, S) state, as the topic map declares it; read-only, as every scorer shares it."""
+        """(T, S) state, as the topic map declares it; read-only, because scorers share it."""
         return _read_only(self.columns(self.topic_map.state))
 
     @cached_property
     def action(self) -> Floats:
-        """(T, A) action, as the topic map declares it; read-only, as every scorer shares it."""
+        """(T, A) action, as the topic map declares it; read-only, because scorers share it."""
         return _read_only(self.columns(self.topic_map.action))
 
     @cached_property
@@ -165,8 +233,8 @@ class Episode:
     def content_digest(self) -> str:
         """SHA-256 over decoded values and stamps from the first one, without identity or window.
 
-        Equal for two copies of one recording, whatever they are called and whenever they claim to
-        have happened. All episodes without a step have the same one.
+        Equal for two copies of one recording under any names and start times. All episodes without
+        a step have the same one.
         """
         return self._hashed("", self.stamps_ns - self.stamps_ns[:1])
 
