@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from rows import row
 
-from curation_ros.batch.audit import PAPER
+from curation_ros.batch.published import TABLE_1
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.scorers import SCORERS, Scorer
 from curation_ros.dataset.episodes import read_episode
@@ -66,7 +66,7 @@ def run() -> list[dict[str, Any]]:
     made = episodes(_N_FITTED + _N_SCORED, np.random.default_rng(0))
     fitted = {name: kind().fit(made[:_N_FITTED]) for name, kind in SCORERS.items()}
     scored = made[_N_FITTED:]
-    paper = [fitted[name] for name in PAPER if name in SCORERS]
+    paper = [fitted[name] for name in TABLE_1 if name in SCORERS]
     costs = {f"cost of {name}": cost_us([scorer], scored) for name, scorer in fitted.items()}
     costs["cost of the seven scorers of the paper"] = cost_us(paper, scored)
     return [

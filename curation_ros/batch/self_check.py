@@ -1,8 +1,8 @@
-"""Proof that labels are never an input: turn them all over in a copy, and score both.
+"""Proof that labels are never an input: flip all of them in a copy, and compare the scores.
 
-The dataset is copied twice, with its bags as links: once as it is, once with everything turned
-over that a person or a simulator has said about the episodes. Both copies are scored and decided
-from scratch. If a single bit differs, something reads labels.
+The dataset is copied twice, with its bags as links. One copy is unchanged. In the other one all
+labels and all decisions of people are flipped. Both copies are scored and decided from scratch.
+If a single bit differs, something reads labels.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.layout import is_dataset
 from curation_ros.files import write_atomically
 
-#: Keys of truth.jsonl that say which episode it is, not how it went: start states order equal
-#: scores. All others are turned over, known or not.
+#: Keys of truth.jsonl that identify an episode; ties of scores are broken by them. The values of
+#: all other keys are flipped, including unknown ones.
 IDENTITY = ("episode", "name", "task", "start", "repetition", "expert_seed")
 _OPPOSITE = {"succeeded": "failed", "failed": "succeeded", "none": "early_release"}
 _OPPOSITE_VERDICT: dict[Verdict, Verdict] = {
@@ -42,30 +42,44 @@ _OPPOSITE_VERDICT: dict[Verdict, Verdict] = {
 
 @dataclass(frozen=True)
 class Difference:
-    """What changed with the labels; both values as JSON text."""
+    """A value that changed with the labels.
+
+    Attributes:
+        episode: id of the episode.
+        name: its short name.
+        field: name of the value.
+        original: the value as JSON text.
+        flipped: the same with all labels flipped.
+    """
 
     episode: str
     name: str
     field: str
     original: str
-    turned: str
+    flipped: str
 
     def to_json(self) -> dict[str, str]:
-        """As printed by `curation self-check --json`."""
-        return dict(vars(self))
+        """A line of `curation self-check --json`."""
+        return {
+            "episode": self.episode,
+            "name": self.name,
+            "field": self.field,
+            "original": self.original,
+            "turned": self.flipped,
+        }
 
 
 @dataclass(frozen=True)
 class SelfCheck:
-    """Outcome of a self-check.
+    """Result of a self-check.
 
     Attributes:
-        labels: values of truth.jsonl that were turned over, of dataset and reference.
-        overrides: decisions of people that were turned over, likewise.
-        episodes: that were scored and decided in both copies.
-        scores: numbers that were compared.
-        unreadable: bags that could be read in neither copy.
-        differences: what changed; empty where labels are not an input.
+        labels: number of flipped values in the truth of dataset and reference.
+        overrides: number of flipped decisions of people in dataset and reference.
+        episodes: number of episodes that were scored and decided in both copies.
+        scores: number of scores that were compared.
+        unreadable: number of bags that could not be read in either copy.
+        differences: what changed; empty if labels are not an input.
     """
 
     labels: int
@@ -86,26 +100,25 @@ def self_check(
     reference: Sequence[Path] = (),
     topic_map: TopicMap | None = None,
 ) -> SelfCheck:
-    """Score and decide with all labels as they are, and with all turned over.
+    """Score and decide with all labels unchanged, and with all labels flipped.
 
     Args:
-        dataset: nothing is written to it.
+        dataset: the dataset to check; nothing is written to it.
         settings: how to score and decide.
-        reference: trusted demonstrations; the labels of those that are datasets are turned over,
-            too.
-        topic_map: how episodes are built; None: by the map in each bag.
+        reference: trusted demonstrations. The labels of those that are datasets are flipped, too.
+        topic_map: how episodes are built; by default the map in each bag.
 
     Raises:
-        CurationError: if there is no label to turn over, or no episode that can be scored.
+        CurationError: if there is no label to flip, or no episode that can be scored.
     """
     with tempfile.TemporaryDirectory(prefix="curation-self-check-") as folder:
         home = Path(folder)
-        plain = _copies(dataset, reference, home / "as-is", turn=False)
-        other = _copies(dataset, reference, home / "turned", turn=True)
+        plain = _copies(dataset, reference, home / "unchanged", flip=False)
+        other = _copies(dataset, reference, home / "flipped", flip=True)
         if not other.labels + other.overrides:
             raise CurationError(
-                f"dataset {dataset.path}: nothing to turn over: no label in truth.jsonl and "
-                "no decision of a person, here or in the reference"
+                f"dataset {dataset.path}: there is no label to flip: neither a label in "
+                "truth.jsonl nor a decision of a person, here or in the reference"
             )
         before, after = (_decide(c, settings, topic_map) for c in (plain, other))
     if not any(before.values()) and not any(after.values()):
@@ -128,7 +141,7 @@ def self_check(
 
 @dataclass(frozen=True)
 class _Copies:
-    """Copies of a dataset and of its reference, and what is a label in them."""
+    """Copies of a dataset and of its reference, and the number of labels in them."""
 
     dataset: Dataset
     reference: list[Path]
@@ -136,56 +149,59 @@ class _Copies:
     overrides: int
 
 
-def _copies(dataset: Dataset, reference: Sequence[Path], home: Path, *, turn: bool) -> _Copies:
+def _copies(dataset: Dataset, reference: Sequence[Path], home: Path, *, flip: bool) -> _Copies:
     target = Dataset(home / "dataset", create=True)
-    counts = [_copy(dataset, target, turn=turn)]
+    counts = [_copy(dataset, target, flip=flip)]
     trusted = []
     for k, path in enumerate(reference):
         if not is_dataset(path):
             trusted.append(path)
             continue
         copied = Dataset(home / f"reference-{k}", create=True)
-        counts.append(_copy(Dataset(path), copied, turn=turn))
+        counts.append(_copy(Dataset(path), copied, flip=flip))
         trusted.append(copied.path)
     labels, overrides = (sum(found) for found in zip(*counts, strict=True))
     return _Copies(target, trusted, labels, overrides)
 
 
-def _copy(source: Dataset, target: Dataset, *, turn: bool) -> tuple[int, int]:
-    """Copy bags as links, truth and decisions as they are or turned over; returns how many were.
+def _copy(source: Dataset, target: Dataset, *, flip: bool) -> tuple[int, int]:
+    """Copy bags as links, and truth and decisions unchanged or flipped.
 
-    What was made from labels or scores (index, selections, policies) stays behind.
+    The results of labels and scores (index, selections, policies) are not copied.
+
+    Returns:
+        Number of labels, and number of decisions of people.
     """
     for bag in source.bags():
         shutil.copytree(bag, target.bag_path(bag.name), copy_function=_link)
     truth = source.truth()
     labels = sum(len(set(record) - set(IDENTITY)) for record in truth.values())
-    records = [turned(r) if turn else r for r in truth.values()]
+    records = [flipped(r) if flip else r for r in truth.values()]
     if records:
         target.truth_log.replace(records)
     overrides = 0
     for episode_id in source.decided_ids():
         decisions = source.decisions(episode_id)
         overrides += sum(d.by != CURATOR for d in decisions)
-        lines = [(_turned_decision(d) if turn else d).to_line() + "\n" for d in decisions]
+        lines = [(_flipped_decision(d) if flip else d).to_line() + "\n" for d in decisions]
         write_atomically(target.decision_log(episode_id), "".join(lines))
     return labels, overrides
 
 
 def _link(source: str, target: str) -> None:
-    """A hard link, so that nothing leads back to the labels as they are; else a symbolic one."""
+    """Make a hard link, through which the unchanged labels cannot be found."""
     try:
         os.link(source, target)
-    except OSError:  # another file system, or one without hard links
+    except OSError:  # another file system, or one without hard links: a symbolic link
         os.symlink(os.path.abspath(source), target)
 
 
-def turned(record: Mapping[str, Any]) -> dict[str, Any]:
-    """A line of truth.jsonl that says the contrary of everything but which episode it is."""
-    return {k: v if k in IDENTITY else _turned_value(k, v) for k, v in record.items()}
+def flipped(record: Mapping[str, Any]) -> dict[str, Any]:
+    """A line of truth.jsonl with another value under each key that is no part of the identity."""
+    return {k: v if k in IDENTITY else _flipped_value(k, v) for k, v in record.items()}
 
 
-def _turned_value(key: str, value: object) -> object:
+def _flipped_value(key: str, value: object) -> object:
     if isinstance(value, bool):
         return not value
     if isinstance(value, (int, float)):
@@ -197,7 +213,7 @@ def _turned_value(key: str, value: object) -> object:
     return 0 if value is None else None
 
 
-def _turned_decision(decision: Decision) -> Decision:
+def _flipped_decision(decision: Decision) -> Decision:
     if decision.by == CURATOR:
         return decision
     return replace(decision, verdict=_OPPOSITE_VERDICT[decision.verdict])
@@ -206,25 +222,25 @@ def _turned_decision(decision: Decision) -> Decision:
 def _decide(
     copies: _Copies, settings: CurationSettings, topic_map: TopicMap | None
 ) -> dict[str, dict[str, Any] | None]:
-    """All that is said about each bag, as plain data; None where it cannot be read."""
+    """Bag -> examination and decision as plain data; None if the bag cannot be read."""
     bags = list(copies.dataset.bags())
     trusted = copies.reference
     curation = Curation.fit(settings, read_reference(trusted, topic_map) if trusted else [])
     if curation.scorers.needs_dataset:
         curation = curation.fit_dataset(EpisodesOf(bags, topic_map))
     examiner = Examiner(curation.scorers, topic_map, fresh=True)
-    said: dict[str, dict[str, Any] | None] = {}
+    results: dict[str, dict[str, Any] | None] = {}
     for one, decision in judge_bags(examiner, curation, bags, tie=copies.dataset.tie(0)):
-        said[one.path.name] = None
+        results[one.path.name] = None
         if decision is not None and isinstance(one.result, Examination):
-            said[one.path.name] = {**one.result.to_json(), **decision.to_json()}
-    return said
+            results[one.path.name] = {**one.result.to_json(), **decision.to_json()}
+    return results
 
 
 def _compare(
     episode_id: str, before: dict[str, Any] | None, after: dict[str, Any] | None
 ) -> list[Difference]:
-    """What differs, by its field; numbers to the last bit, as `repr` shows them exactly."""
+    """The fields that differ; numbers are compared to the last bit, as JSON shows them exactly."""
     name = str((before or after or {}).get("name", ""))
     if before is None or after is None:
         if before is after:

@@ -1,4 +1,4 @@
-"""`curation self-check`: turn all labels over in a copy, and prove that no score changes."""
+"""`curation self-check`: flips all labels in a copy and checks that no score changes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.scorers import scorer_names
 from curation_ros.dataset.dataset import Dataset
 
-_PROVEN, _DIFFERS = 0, 1
+_EQUAL, _DIFFERENT = 0, 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check, and say what was compared; 1 where something depends on labels."""
+    """Check and print; the exit code is 1 if something depends on labels."""
     config = args.config or share_file("config/curation.yaml")
     settings = read_settings(config, {"scorers": scorer_names()})
     topic_map = read_topic_map(args.topic_map) if args.topic_map else None
@@ -33,18 +33,18 @@ def run(args: argparse.Namespace) -> int:
         if args.json:
             print_json(difference.to_json())
         else:
-            who = difference.name or difference.episode[:8]
-            say(f"{who}: {difference.field}: {difference.original} / {difference.turned}")
+            name = difference.name or difference.episode[:8]
+            say(f"{name}: {difference.field}: {difference.original} / {difference.flipped}")
     if args.json:
         print_json(done.to_json())
     else:
         say(
-            f"turned over: {done.labels} labels and {done.overrides} decisions of people; "
-            f"compared: {done.scores} scores of {done.episodes} episodes with their decisions, "
+            f"flipped {done.labels} labels and {done.overrides} decisions of people; "
+            f"compared {done.scores} scores of {done.episodes} episodes, and their decisions, "
             "reasons and findings"
         )
         if done.unreadable:
             say(f"{done.unreadable} bags could not be read")
         n = len(done.differences)
-        say(f"{n} differences: something reads labels" if n else "all equal to the last bit")
-    return _DIFFERS if done.differences else _PROVEN
+        say(f"{n} differences: something reads labels" if n else "all are equal to the last bit")
+    return _DIFFERENT if done.differences else _EQUAL

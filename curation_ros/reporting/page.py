@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from curation_ros.batch import published
+from curation_ros.batch.audit_rows import NOT_IDENTIFIABLE
 from curation_ros.core.types import JsonObject
-from curation_ros.reporting import panels, published, tables
+from curation_ros.reporting import panels, tables
 from curation_ros.reporting.answers import answers
 from curation_ros.reporting.blocks import Block, Figure, Page, Points, Section, Text, missing
 from curation_ros.reporting.cells import number
@@ -179,7 +181,7 @@ def _audits(results: JsonObject) -> Iterator[Block]:
             notes += [
                 f"{row['scorer']}: {note}"
                 for note in row["notes"]
-                if not note.startswith("not identifiable")
+                if not note.startswith(NOT_IDENTIFIABLE)
             ]
         if notes:
             yield Points(tuple(notes))

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MultipleLocator, PercentFormatter
 
+from curation_ros.batch import published
 from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.types import JsonObject
-from curation_ros.reporting import published
 from curation_ros.reporting.drawing import Drawing
 from curation_ros.reporting.plotting import (
     BLUE,

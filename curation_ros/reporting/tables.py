@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
+from curation_ros.batch import published
 from curation_ros.core.types import JsonObject
-from curation_ros.reporting import published
 from curation_ros.reporting.blocks import Table
 from curation_ros.reporting.cells import (
     NOTHING,

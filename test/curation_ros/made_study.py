@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scenes import LIFT_AT, RELEASE_AT, scene
 
-from curation_ros.batch.audit import PAPER
+from curation_ros.batch.published import TABLE_1
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.statistics import detection
 from curation_ros.dataset.dataset import Dataset
@@ -181,8 +181,7 @@ def _pool(folder: Path, name: str, plan: StudyPlan, rng: np.random.Generator) ->
     for scorer, some in scores.items():
         auroc = detection.auroc(list(some.values()), labels)
         interval = list(detection.auroc_interval(auroc, n_good, n - n_good))
-        paper = PAPER.get(scorer)
-        keys = ("raw", "truncated", "truncated_joined_by_name")
+        paper = TABLE_1.get(scorer)
         audited.append(
             {
                 "scorer": scorer,
@@ -194,7 +193,7 @@ def _pool(folder: Path, name: str, plan: StudyPlan, rng: np.random.Generator) ->
                 "keep": plan.keep_for_audit,
                 "precision": 0.25,
                 "clean_recall": 0.5,
-                "paper": dict(zip(keys, paper, strict=True)) if paper else None,
+                "paper": paper.to_json() if paper else None,
                 "notes": ["12 abstained: <why>"] if scorer == "entropy" else [],
             }
         )

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from episodes import make_episode, make_reference
+from streams import record
 
-from curation_ros.batch.audit import PAPER, Audit, AuditSettings, audit
+from curation_ros.batch.audit import Audit, AuditSettings, audit, audit_dataset
+from curation_ros.batch.published import TABLE_1
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError, EpisodeError
 from curation_ros.core.scorers import SCORERS
@@ -244,7 +246,7 @@ def test_rows_are_in_the_papers_order_with_its_figures(
         make_reference(rng),
         _settings(scorers=tuple(SCORERS)),
     )
-    assert [row["scorer"] for row in audited.rows][: len(PAPER)] == list(PAPER)
+    assert [row["scorer"] for row in audited.rows][: len(TABLE_1)] == list(TABLE_1)
     assert _row(audited, "gripper_timing")["paper"] == {
         "raw": 0.957,
         "truncated": 0.804,
@@ -370,3 +372,25 @@ def test_shortest_success_without_a_success_is_refused(
         dataset.append_truth({"episode": episode.id, "outcome": "failed", "defect": defect})
     with pytest.raises(CurationError, match="no episode of the dataset succeeded"):
         audit(dataset, episodes, settings=_settings(labels="defect", length="shortest-success"))
+
+
+# --- datasets -----------------------------------------------------------------------------------
+
+
+def test_bags_that_cannot_be_read_are_listed_and_the_others_audited(
+    dataset: Dataset, rng: np.random.Generator
+) -> None:
+    broken = dataset.bag_path("broken")
+    broken.mkdir()
+    (broken / "broken_0.mcap").write_bytes(b"")
+    with pytest.raises(EpisodeError, match=r"no episode that can be read; 1 bags.*broken"):
+        audit_dataset(dataset, settings=_settings())
+    for k in range(4):
+        episode = make_episode(rng, 228 + 6 * k, open_at=-1 if k < 2 else 120)
+        record(dataset, _told(dataset, episode, k < 2))
+    audited = audit_dataset(dataset, settings=_settings())
+    assert len(audited.problems) == 1
+    assert str(broken) in audited.problems[0]
+    assert (audited.facts["n_good"], audited.facts["n_bad"]) == (2, 2)
+    for line, row in zip(audited.to_json(), audited.rows, strict=True):
+        assert line["notes"] == [*row["notes"], *audited.notes]

@@ -1,4 +1,4 @@
-"""The self-check proves what it says, and finds what reads labels."""
+"""The self-check finds scorers that read labels, and nothing else."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from episodes import make_episode, make_reference
 from peeking import Peeker, bag_being_read
 from streams import record
 
-from curation_ros.batch.self_check import IDENTITY, self_check, turned
+from curation_ros.batch.self_check import IDENTITY, flipped, self_check
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.episode import Episode
@@ -42,7 +42,7 @@ TRUTH: dict[str, Any] = {
 
 
 class Listener(Peeker):
-    """Follows what people have decided."""
+    """Scores by what people have decided."""
 
     def look(self, episode: Episode) -> Look:
         """1.0 where the last line of the log is a keep."""
@@ -51,7 +51,7 @@ class Listener(Peeker):
 
 
 class Resolver(Peeker):
-    """Follows links to the original, as far as they lead there."""
+    """Follows links to the original, if there are any."""
 
     def look(self, episode: Episode) -> Look:
         """As its parent, from where the bag's own file really is."""
@@ -90,8 +90,8 @@ def _files(folder: Path) -> Iterator[tuple[str, bytes]]:
             yield str(path), path.read_bytes()
 
 
-def test_everything_but_the_identity_is_turned_over() -> None:
-    other = turned({"episode": "a", **TRUTH})
+def test_everything_but_the_identity_is_flipped() -> None:
+    other = flipped({"episode": "a", **TRUTH})
     for key, value in {"episode": "a", **TRUTH}.items():
         assert (other[key] == value) == (key in IDENTITY), key
     assert (other["outcome"], other["defect"]) == ("failed", "early_release")
@@ -111,7 +111,7 @@ def test_everything_but_the_identity_is_turned_over() -> None:
     ],
 )
 def test_each_label_becomes_another_one(key: str, value: object, expected: object) -> None:
-    assert turned({key: value}) == {key: expected}
+    assert flipped({key: value}) == {key: expected}
 
 
 def test_scores_and_decisions_are_equal_to_the_last_bit(
@@ -151,7 +151,7 @@ def test_scorer_that_reads_the_truth_is_found(told: Dataset, cheat: str) -> None
     done = self_check(told, _settings(cheat))
     scores = [d for d in done.differences if d.field == "score/cheat"]
     assert len(scores) == 4
-    assert {(d.original, d.turned) for d in scores} == {("1.0", "0.0"), ("0.0", "1.0")}
+    assert {(d.original, d.flipped) for d in scores} == {("1.0", "0.0"), ("0.0", "1.0")}
     assert {d.name for d in scores} == {f"pick-{k}" for k in range(4)}
     assert not [d for d in done.differences if d.field == "score/knn"]
 
@@ -187,7 +187,7 @@ def test_dataset_without_any_label_is_nothing_to_check(
     dataset: Dataset, rng: np.random.Generator
 ) -> None:
     record(dataset, make_episode(rng))
-    with pytest.raises(CurationError, match=r"no label in truth\.jsonl and no decision"):
+    with pytest.raises(CurationError, match=r"neither a label in truth\.jsonl nor a decision"):
         self_check(dataset, _settings())
 
 

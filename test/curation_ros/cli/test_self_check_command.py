@@ -39,8 +39,8 @@ def test_proof_is_told_to_programs(curation: Run, folder: Path, told_data: Path)
 def test_proof_is_told_to_people(curation: Run, told_data: Path) -> None:
     told = curation("self-check", told_data)
     assert told.code == PROVEN, told.err
-    assert told.out.startswith("turned over: 10 labels and 0 decisions of people; compared: ")
-    assert told.out.endswith("all equal to the last bit\n")
+    assert told.out.startswith("flipped 10 labels and 0 decisions of people; compared ")
+    assert told.out.endswith("all are equal to the last bit\n")
 
 
 def test_differences_are_listed_with_code_1(
@@ -62,7 +62,7 @@ def test_differences_are_listed_with_code_1(
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (["data"], NOTHING, "nothing to turn over"),
+        (["data"], NOTHING, "there is no label to flip"),
         (["none"], NOTHING, "no folder 'episodes' in it"),
         (["data", "--config", "none.yaml"], USAGE, "none.yaml"),
         (["data", "--reference", "none"], NOTHING, "none"),

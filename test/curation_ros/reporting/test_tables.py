@@ -13,7 +13,8 @@ pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
 from reading import bounds, cells, same, stage_of  # noqa: E402 - after the checks
 
-from curation_ros.reporting import published, tables  # noqa: E402 - as above
+from curation_ros.batch import published  # noqa: E402 - as above
+from curation_ros.reporting import tables  # noqa: E402 - as above
 from curation_ros.reporting.cells import NOTHING  # noqa: E402 - as above
 
 
