@@ -1,5 +1,6 @@
 # make demo    the whole path in front of you: record, score, decide, train, drive (5 minutes)
-# make test    checks and tests, as CI runs them
+# make quick   checks, and the tests that need no ROS, simulator or torch (a minute)
+# make test    checks and all tests, as CI runs them
 # make docs    docs/metrics.md anew, from the code
 # make bench   the benchmarks (half an hour)
 # make benchmark   the paper's experiment: collect, score, select, train, roll out, report (an hour)
@@ -15,10 +16,15 @@ TORCH ?=
 ifdef TORCH_BACKEND
 export UV_TORCH_BACKEND := $(TORCH_BACKEND)
 endif
-# Of the extras, so that asking for others installs them.
+# A stamp per set of extras, so that asking for others installs them.
 READY := $(VENV)/.ready-$(EXTRAS)
+# For `make quick`, any installation with the extra test will do.
+QUICK := $(firstword $(wildcard $(VENV)/.ready-*test) $(VENV)/.ready-test)
+# Two of the workers fit into 8 GB. A file's tests stay together, because they share fixtures.
+PYTEST := $(BIN)/python -m pytest
+PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: setup demo test check bench benchmark docs clean
+.PHONY: setup demo quick test check bench benchmark docs clean
 
 setup: $(READY)
 
@@ -30,8 +36,8 @@ $(BIN)/uv:
 		{ rm -rf $(VENV); echo "error: $(PYTHON) cannot make $(VENV): apt install python3-venv" >&2; exit 2; }
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
 
-$(READY): setup.py package.xml curation_ros/nodes/programs.py $(wildcard launch/* config/*) | $(BIN)/uv
-	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[$(EXTRAS)]' $(if $(TORCH),'$(TORCH)')
+$(VENV)/.ready-%: setup.py package.xml curation_ros/nodes/programs.py $(wildcard launch/* config/*) | $(BIN)/uv
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[$*]' $(if $(TORCH),'$(TORCH)')
 	@# An editable installation leaves out what ros2 run and ros2 launch look up; colcon does this too.
 	@$(BIN)/python -W ignore setup.py --quiet install_data --install-dir $(abspath $(VENV))
 	@touch $@
@@ -39,15 +45,25 @@ $(READY): setup.py package.xml curation_ros/nodes/programs.py $(wildcard launch/
 demo: setup
 	@$(BIN)/curation demo
 
-check: setup
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	$(BIN)/lint-imports
-	$(BIN)/python docs/make_metrics.py --check
+define CHECKS
+$(BIN)/ruff check .
+$(BIN)/ruff format --check .
+$(BIN)/mypy
+$(BIN)/lint-imports --no-logo
+$(BIN)/python docs/make_metrics.py --check
+endef
 
+check: setup
+	$(CHECKS)
+
+quick: $(QUICK)
+	$(CHECKS)
+	$(PYTEST) $(PARALLEL) -m 'not ros and not sim and not policy'
+
+# The tests of the graph come last and one by one: they share the machine with their nodes.
 test: check
-	$(BIN)/python -m pytest
+	$(PYTEST) $(PARALLEL) -m 'not ros'
+	$(PYTEST) -m ros
 
 docs: setup
 	$(BIN)/python docs/make_metrics.py

@@ -112,8 +112,11 @@ setup(
             "mcap-ros2-support-fast>=0.5",
             "monalysa==0.2.1",  # the SPARC of its authors, to compare with
             "mypy>=1.11",
+            "pre-commit>=3.2",
+            "pre-commit-hooks>=4.5",
             "pyarrow>=14",
             "pytest>=8",
+            "pytest-xdist>=3.5",
             "ray>=2.9",
             "ruff>=0.9",
             "types-PyYAML",

@@ -35,68 +35,27 @@ ARGUMENTS = (
 
 
 def generate_launch_description() -> LaunchDescription:
-    def text(name):
-        return ParameterValue(LaunchConfiguration(name), value_type=str)
-
-    def number(name, kind):
-        return ParameterValue(LaunchConfiguration(name), value_type=kind)
-
-    def others_follow(event, context):
-        if context.is_shutdown:  # Ctrl-C has reached every node
-            return []
-        return [Shutdown(reason=f"{event.process_name} has ended with code {event.returncode}")]
-
-    with_sim = LaunchConfiguration("sim")
-    common = {"dataset": text("dataset")}
-    mapped = {**common, "topic_map": text("topic_map")}
-    recorder = Node(
-        package="curation_ros",
-        executable="recorder",
-        output="screen",
-        on_exit=others_follow,
-        parameters=[{**mapped, "auto": number("sim", bool)}],
+    common = {"dataset": _text("dataset")}
+    mapped = {**common, "topic_map": _text("topic_map")}
+    recorder = _node("recorder", {**mapped, "auto": _number("sim", bool)}, on_exit=_others_follow)
+    reference = ParameterValue(["[", LaunchConfiguration("reference"), "]"])
+    curator = _node(
+        "curator",
+        {**mapped, "config": _text("config"), "reference": reference},
+        on_exit=_others_follow,
     )
-    curator = Node(
-        package="curation_ros",
-        executable="curator",
-        output="screen",
-        on_exit=others_follow,
-        parameters=[
-            {
-                **mapped,
-                "config": text("config"),
-                "reference": ParameterValue(["[", LaunchConfiguration("reference"), "]"]),
-            }
-        ],
+    sim = _node(
+        "sim_node",
+        {
+            **common,
+            "episodes": _number("episodes", int),
+            "contamination": _number("contamination", float),
+            "defect": _text("defect"),
+            "seed": _number("seed", int),
+            "wait_for": ["recorder", "curator"],
+        },
+        condition=IfCondition(LaunchConfiguration("sim")),
     )
-    sim = Node(
-        package="curation_ros",
-        executable="sim_node",
-        output="screen",
-        condition=IfCondition(with_sim),
-        parameters=[
-            {
-                **common,
-                "episodes": number("episodes", int),
-                "contamination": number("contamination", float),
-                "defect": text("defect"),
-                "seed": number("seed", int),
-                "wait_for": ["recorder", "curator"],
-            }
-        ],
-    )
-
-    def sim_has_ended(event, context):
-        if context.is_shutdown or event.returncode:
-            return others_follow(event, context)
-        return [
-            LogInfo(msg="sim_node has ended; recorder and curator follow"),
-            TimerAction(
-                period=_LAST_DECISION_S,
-                actions=[Shutdown(reason="all demonstrations are recorded")],
-            ),
-        ]
-
     return LaunchDescription(
         [
             *(
@@ -104,7 +63,7 @@ def generate_launch_description() -> LaunchDescription:
                 for name, default, description in ARGUMENTS
             ),
             # Registered before the sim node starts: one that refuses its parameters ends at once.
-            RegisterEventHandler(OnProcessExit(target_action=sim, on_exit=sim_has_ended)),
+            RegisterEventHandler(OnProcessExit(target_action=sim, on_exit=_sim_has_ended)),
             # First, because launch gives up at a node with an argument that is no number, and
             # leaves the nodes running that it has already started.
             sim,
@@ -112,3 +71,39 @@ def generate_launch_description() -> LaunchDescription:
             curator,
         ]
     )
+
+
+def _text(name):
+    return ParameterValue(LaunchConfiguration(name), value_type=str)
+
+
+def _number(name, kind):
+    return ParameterValue(LaunchConfiguration(name), value_type=kind)
+
+
+def _node(executable, parameters, **settings):
+    return Node(
+        package="curation_ros",
+        executable=executable,
+        output="screen",
+        parameters=[parameters],
+        **settings,
+    )
+
+
+def _others_follow(event, context):
+    if context.is_shutdown:  # Ctrl-C has reached every node
+        return []
+    return [Shutdown(reason=f"{event.process_name} has ended with code {event.returncode}")]
+
+
+def _sim_has_ended(event, context):
+    if context.is_shutdown or event.returncode:
+        return _others_follow(event, context)
+    return [
+        LogInfo(msg="sim_node has ended; recorder and curator follow"),
+        TimerAction(
+            period=_LAST_DECISION_S,
+            actions=[Shutdown(reason="all demonstrations are recorded")],
+        ),
+    ]

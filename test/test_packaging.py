@@ -15,6 +15,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
+import yaml
 
 import curation_ros
 from curation_ros.configuration import share_file
@@ -180,6 +181,8 @@ def test_version_is_the_same_everywhere():
     version = curation_ros.__version__
     assert _setup("--version").strip() == version
     assert _package_xml().findtext("version") == version
+    citation = ROOT / "CITATION.cff"
+    assert re.findall(r"^version: (.+)$", citation.read_text(), re.MULTILINE) == [version]
     changelog = ROOT / "CHANGELOG.md"
     if changelog.is_file():
         newest = re.search(r"^## \[(.+?)\]", changelog.read_text(), re.MULTILINE)
@@ -242,6 +245,17 @@ def test_entry_points_are_the_nodes_and_can_be_imported(installed):
     points = {p.name: p for p in ours.entry_points if p.group == "console_scripts"}
     assert set(points) == PROGRAMS
     assert all(callable(point.load()) for point in points.values())
+
+
+def test_hooks_run_tools_of_the_extra_test():
+    """Nothing is downloaded from elsewhere."""
+    (repository,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    assert repository["repo"] == "local"
+    programs = {hook["entry"].split()[0] for hook in repository["hooks"]}
+    assert {"ruff", "mypy", "lint-imports"} < {Path(program).name for program in programs}
+    for program in programs:
+        assert Path(program).parent == Path(".venv/bin")
+        assert (Path(sys.executable).parent / Path(program).name).exists(), program
 
 
 @pytest.mark.parametrize("module", NODE_MODULES.values())

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+pytest.importorskip("mujoco")
+
 from curation_ros.core.errors import ConfigError, SimError
 from sim_node import quiet_libero
 from sim_node.env import BOWL, PLATE, LiberoEnv
