@@ -19,6 +19,7 @@ import yaml
 
 import curation_ros
 from curation_ros.configuration import share_file
+from curation_ros.core.episode import messages
 from curation_ros.nodes.processes import Domain
 from curation_ros.nodes.programs import NODE_MODULES
 
@@ -200,7 +201,7 @@ def test_package_xml_is_that_of_an_ament_python_package():
     assert re.fullmatch(r"[\w.+-]+@[\w-]+(\.[\w-]+)*\.[a-z]{2,}", email)
 
 
-def test_package_xml_declares_the_ros_packages_that_are_imported():
+def test_package_xml_declares_the_ros_packages_that_are_used():
     imported = {
         module
         for folder in (*PACKAGES, "launch")
@@ -208,6 +209,9 @@ def test_package_xml_declares_the_ros_packages_that_are_imported():
         for module in _imports(path)
         if re.fullmatch(r"rclpy|launch(_ros)?|.*_(msgs|srvs|interfaces)", module)
     }
+    # Types of messages that are made from plain data are imported by name.
+    made = [name for name in vars(messages).values() if re.match(r"\w+/msg/\w+$", str(name))]
+    imported |= {name.partition("/")[0] for name in made}
     declared = {
         element.text
         for element in _package_xml().iter("exec_depend")
