@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from curation_ros.core.decision.rules import RULES, Rule
 from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap, read_topic_map
 from curation_ros.core.errors import ConfigError
+from curation_ros.core.yaml_file import read_yaml
 from curation_ros.dataset.episodes import find_bags, read_episode
 
+_WHAT = "curation config"
 _SOURCE = Path(__file__).resolve().parents[1]
 #: What YAML must hold for each field of CurationSettings.
 _KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
@@ -64,7 +64,7 @@ def read_settings(config: Path | None, overrides: Mapping[str, Any]) -> Curation
     Raises:
         ConfigError: naming file and key.
     """
-    where = f"curation config {config}"
+    where = f"{_WHAT} {config}"
     settings = {} if config is None else _read_file(config, where)
     given = {k: v for k, v in overrides.items() if v not in (None, "", (), [], {})}
     if given.get("rule", settings.get("rule")) != settings.get("rule"):
@@ -85,12 +85,7 @@ def read_settings(config: Path | None, overrides: Mapping[str, Any]) -> Curation
 
 
 def _read_file(config: Path, where: str) -> dict[str, Any]:
-    try:
-        raw = yaml.safe_load(config.read_text())
-    except OSError as err:
-        raise ConfigError(f"{where}: {err.strerror}") from err
-    except (yaml.YAMLError, ValueError) as err:  # an impossible date is a ValueError
-        raise ConfigError(f"{where} is not YAML: {str(err).splitlines()[0]}") from err
+    raw = read_yaml(config, _WHAT)
     if not isinstance(raw, dict):
         raise ConfigError(f"{where}: expected a mapping, found {raw!r:.60}")
     for key, value in raw.items():

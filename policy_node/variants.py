@@ -12,6 +12,7 @@ import yaml
 
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import ConfigError, PolicyError
+from curation_ros.core.yaml_file import read_yaml
 from policy_node.action import CommandTerm, action_spec
 from policy_node.observation import observation_spec
 from policy_node.settings import TrainingSettings
@@ -142,14 +143,9 @@ def read_training_config(path: Path) -> TrainingConfig:
         ConfigError: if the file is missing, is not YAML, or a key or value is none; the message
             names the file, the key, what was found and what was expected.
     """
-    where = f"training config {path}"
-    try:
-        raw = yaml.safe_load(path.read_text())
-    except OSError as err:
-        raise ConfigError(f"{where}: {err.strerror}") from err
-    except (yaml.YAMLError, ValueError) as err:  # an impossible date is a ValueError
-        raise ConfigError(f"{where} is not YAML: {str(err).splitlines()[0]}") from err
-    raw = _mapping(raw, where, ("settings", "variants"))
+    what = "training config"
+    where = f"{what} {path}"
+    raw = _mapping(read_yaml(path, what), where, ("settings", "variants"))
     settings = settings_from(raw.get("settings") or {}, f"{where}: settings")
     variants = raw.get("variants") or {}
     if not isinstance(variants, Mapping):

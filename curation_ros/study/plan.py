@@ -10,10 +10,9 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.scorers import SCORERS, find_scorer, is_scorer
+from curation_ros.core.yaml_file import read_yaml
 from curation_ros.study.terms import Term, parse_row
 from policy_node.settings import DEFAULTS
 
@@ -169,11 +168,11 @@ def read_plan(path: Path) -> StudyPlan:
     Raises:
         ConfigError: naming the file and the key that is wrong.
     """
-    raw = _read_yaml(path)
+    raw = _read_mapping(path)
     for stage in raw.get("stages") or ():
         beside = stage.pop("contrasts_file", None) if isinstance(stage, dict) else None
         if beside is not None:
-            contrasts = _read_yaml(path.parent / str(beside))
+            contrasts = _read_mapping(path.parent / str(beside))
             stage["contrasts"] = contrasts.get("contrasts")
     try:
         return plan_from(raw)
@@ -295,16 +294,8 @@ def _checked(raw: Any, kind: type[Any], what: str, leave: Sequence[str] = ()) ->
     return dict(raw)
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        raw = yaml.safe_load(path.read_text())
-    except OSError as err:
-        raise ConfigError(f"{path}: {err.strerror}") from err
-    except (yaml.YAMLError, ValueError) as err:
-        mark = getattr(err, "problem_mark", None)
-        line = f", line {mark.line + 1}" if mark is not None else ""
-        what = getattr(err, "problem", None) or str(err).splitlines()[0]
-        raise ConfigError(f"{path}{line}: not YAML: {what}") from err
+def _read_mapping(path: Path) -> dict[str, Any]:
+    raw = read_yaml(path, "study")
     if not isinstance(raw, dict):
-        raise ConfigError(f"{path}: expected a mapping, found {raw!r:.60}")
+        raise ConfigError(f"study {path}: expected a mapping, found {raw!r:.60}")
     return raw

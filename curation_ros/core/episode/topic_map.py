@@ -10,9 +10,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from curation_ros.core.errors import ConfigError
+from curation_ros.core.yaml_file import read_yaml
 
 ROLES = ("clock", "observation", "action", "gripper", "phase", "object", "effector")
 STAMPS = ("header", "source")
@@ -329,10 +328,4 @@ def read_topic_map(path: Path) -> TopicMap:
     Raises:
         ConfigError: if the file is missing, is not YAML or is no topic map.
     """
-    try:
-        raw = yaml.safe_load(path.read_text())
-    except OSError as err:
-        raise ConfigError(f"topic map {path}: {err.strerror}") from err
-    except (yaml.YAMLError, ValueError) as err:  # an impossible date is a ValueError
-        raise ConfigError(f"topic map {path} is not YAML: {str(err).splitlines()[0]}") from err
-    return topic_map_from_json(raw, str(path))
+    return topic_map_from_json(read_yaml(path, "topic map"), str(path))

@@ -122,7 +122,11 @@ def test_more_contrasts_than_were_to_be_planned_are_refused() -> None:
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("a: [", "line 1: not YAML"), ("- 1", "expected a mapping"), (None, "No such file")],
+    [
+        ("a: [", "is not YAML, line 1"),
+        ("- 1", "expected a mapping"),
+        (None, "No such file"),
+    ],
 )
 def test_files_that_are_no_plan_are_named(tmp_path: Path, text: str | None, said: str) -> None:
     path = tmp_path / "plan.yaml"
