@@ -16,7 +16,8 @@ from curation_ros.core.evidence.baseline import Baseline
 from curation_ros.core.evidence.checks import check_episode
 from curation_ros.core.evidence.gripper import gripper_findings
 from curation_ros.core.evidence.length_control import LengthControl
-from curation_ros.core.scorers import Look, PoolScorer, Scorer
+from curation_ros.core.scorers import SCORERS, Look, PoolScorer, Scorer
+from curation_ros.core.scorers.registry import contained
 
 if TYPE_CHECKING:
     from curation_ros.core.episode.episode import Episode
@@ -124,14 +125,16 @@ class FittedScorers:
             for name, pool in pools.items():
                 try:
                     [view] = views(pool, [episode], length)
-                    rows[name][episode.id] = pool.summary(view)
+                    with contained(name):
+                        rows[name][episode.id] = pool.summary(view)
                 except EpisodeError:  # the scorer will abstain on this episode
                     continue
         unfitted = {name: why for name, why in self.unfitted.items() if name not in pools}
         for name, pool in pools.items():
             found = sorted(rows[name])
             try:
-                pool.fit_summaries(found, [rows[name][i] for i in found])
+                with contained(name):
+                    pool.fit_summaries(found, [rows[name][i] for i in found])
             except EpisodeError as err:
                 unfitted[name] = str(err)
         return replace(
@@ -159,14 +162,16 @@ class FittedScorers:
                 abstained[name] = self.unfitted.get(name, no_view)
                 continue
             try:
-                look = scorer.look(part)
+                with contained(name):
+                    look = scorer.look(part)
+                    score = float(look.score)
             except EpisodeError as err:  # Abstain is one
                 abstained[name] = str(err)
                 continue
-            if math.isfinite(look.score):
+            if math.isfinite(score):
                 found[name], shown[name] = look, part
             else:
-                abstained[name] = f"its score is {look.score}"
+                abstained[name] = f"its score is {score}"
         return Looks(found, abstained, shown, tuple(self.scorers))
 
     def score(self, episode: Episode) -> tuple[dict[str, float | None], dict[str, str]]:
@@ -190,6 +195,7 @@ class FittedScorers:
                     "params": scorer.params(),
                     "fitted": scorer.fitted(),
                     "unfitted": self.unfitted.get(name),
+                    **_origin(name, scorer),
                 }
                 for name, scorer in self.scorers.items()
             },
@@ -213,7 +219,7 @@ class FittedScorers:
             params = ", ".join(f"{k}={v}" for k, v in scorer.params().items())
             line += f" ({params})" if params else ""
             fitted = scorer.fitted().get("k_")
-            if fitted is not None and fitted < scorer.params()["k"]:
+            if fitted is not None and fitted < scorer.params().get("k", fitted):
                 line += f"; only {fitted} reference episodes to compare with"
             if name in self.unfitted:
                 line += f"; abstains: {self.unfitted[name]}"
@@ -247,7 +253,8 @@ def fit_scorers(settings: CurationSettings, reference: Iterable[Episode]) -> Fit
             unfitted[name] = NO_REFERENCE
         else:
             try:
-                scorer.fit(views(scorer, episodes, length))
+                with contained(name):
+                    scorer.fit(views(scorer, episodes, length))
             except EpisodeError as err:
                 unfitted[name] = str(err)
     return FittedScorers(
@@ -258,6 +265,12 @@ def fit_scorers(settings: CurationSettings, reference: Iterable[Episode]) -> Fit
         baseline=Baseline().fit(episodes),
         reference_ids=tuple(e.id for e in episodes),
     )
+
+
+def _origin(name: str, scorer: Scorer) -> dict[str, str]:
+    """Where a scorer of another package comes from, as two packages may use one name."""
+    kind = type(scorer)
+    return {} if name in SCORERS else {"class": f"{kind.__module__}:{kind.__qualname__}"}
 
 
 def views(scorer: Scorer, episodes: Sequence[Episode], length: LengthControl) -> list[Episode]:

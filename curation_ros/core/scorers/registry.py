@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING
 
-from curation_ros.core.errors import ConfigError
+from curation_ros.core.errors import ConfigError, CurationError, EpisodeError
 from curation_ros.core.scorers.ensemble import Ensemble
 from curation_ros.core.scorers.entropy import Entropy
 from curation_ros.core.scorers.grip_consistency import GripConsistency
@@ -143,6 +145,29 @@ def find_scorer(name: str) -> type[Scorer]:
         if offer.name == name:
             return offer.load()
     raise ConfigError(f"no scorer {name!r}; there are {', '.join(scorer_names())}")
+
+
+@contextmanager
+def contained(name: str) -> Iterator[None]:
+    """Turn what a scorer of another package raises into an EpisodeError.
+
+    A fault of such a scorer must not stop the others: it abstains, with the fault as the reason.
+    In a scorer of ours an unexpected exception is a bug and is raised as it is.
+
+    Args:
+        name: of the scorer that runs in this context.
+
+    Raises:
+        EpisodeError: with type and message of the exception.
+    """
+    try:
+        yield
+    except CurationError:
+        raise
+    except Exception as err:
+        if name in SCORERS:
+            raise
+        raise EpisodeError(f"{type(err).__name__}: {err}") from err
 
 
 def all_scorers() -> dict[str, type[Scorer]]:

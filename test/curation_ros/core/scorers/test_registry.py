@@ -11,13 +11,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from episodes import make_episode
+from episodes import make_episode, make_reference
 from other_packages import install
 from streams import record
 
+from curation_ros.core.decision.fitted_scorers import fit_scorers
+from curation_ros.core.decision.settings import CurationSettings
+from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.scorers import (
     SCORERS,
+    Look,
+    Scorer,
     all_scorers,
     find_scorer,
     is_scorer,
@@ -161,3 +166,49 @@ def test_bags_are_scored_by_a_scorer_of_another_package(
     moving = {e.id: float((abs(e.fields["twist"]).max(axis=1) > 0.1).mean()) for e in episodes}
     assert {row["episode"]: row["scores"]["pauses"] for row in rows} == moving
     assert len(set(moving.values())) > 1
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        (PAUSES.replace('field("twist")', 'field("twist")[10**6]'), "IndexError: index 1000000"),
+        (PAUSES.replace("Look(float(", "dict(score=float("), "AttributeError: 'dict' object"),
+        (
+            PAUSES.replace("    def look", "    def fit(self, _):\n        1 / 0\n\n    def look"),
+            "ZeroDivisionError: division by zero",
+        ),
+    ],
+)
+def test_fault_in_a_scorer_of_another_package_is_its_reason_to_abstain(
+    installed: Any, rng: np.random.Generator, code: str, reason: str
+) -> None:
+    installed({"pauses": "arm_scorers:Pauses"}, code)
+    settings = CurationSettings(scorers=("pauses", "length"), rule="none", rule_scorer="length")
+    fitted = fit_scorers(settings, make_reference(rng))
+    scores, abstained = fitted.score(make_episode(rng))
+    assert scores == {"pauses": None, "length": -240.0}
+    assert abstained["pauses"].startswith(reason)
+
+
+def test_fault_in_a_scorer_of_ours_is_raised(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    def look(_: Scorer, episode: Episode) -> Look:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(SCORERS["length"], "look", look)
+    settings = CurationSettings(scorers=("length",), rule="none", rule_scorer="length")
+    with pytest.raises(ZeroDivisionError, match="a bug"):
+        fit_scorers(settings, []).look(make_episode(rng))
+
+
+def test_scoring_hash_tells_packages_apart_that_use_one_name(installed: Any) -> None:
+    settings = {"scorers": ("pauses",), "rule": "none", "rule_scorer": "pauses"}
+    hashes = set()
+    for package in ("arm-scorers", "leg-scorers"):
+        installed({"pauses": f"{package.replace('-', '_')}:Pauses"}, package=package)
+        (mine,) = (o for o in registry._foreign() if o.package.startswith(package))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(registry, "_foreign", lambda mine=mine: (mine,))
+            hashes.add(fit_scorers(CurationSettings(**settings), []).scoring_hash)
+    assert len(hashes) == 2
