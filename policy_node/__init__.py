@@ -1,5 +1,6 @@
-"""Behaviour cloning that judges a selection: train with torch, act with NumPy alone.
+"""Policies: what they are, training by behaviour cloning, and driving a robot or a simulator.
 
-Everything but `node` imports no ROS, everything but `train` no torch, and everything but
-`rollouts` no simulator.
+`policy` is the protocol that every policy follows, and `testing` its conformance check. Only
+`node` imports ROS, only the training modules import torch, and only `rollouts` imports the
+simulator.
 """

@@ -1,4 +1,4 @@
-"""`curation benchmark`: a study from its plan to its report; killed at any point, it goes on."""
+"""`curation benchmark`: a study from its plan to its report; the same command resumes it."""
 
 from __future__ import annotations
 
@@ -25,23 +25,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--config", type=Path, help="the plan; default config/paper.yaml, which explains the keys"
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("results"), help="the study is in OUT/<name>"
+        "--out", type=Path, default=Path("results"), help="the study is written to OUT/<name>"
     )
-    parser.add_argument(
-        "--data", type=Path, help="where its demonstrations are, or go; default OUT/data"
-    )
+    parser.add_argument("--data", type=Path, help="folder of its demonstrations; default OUT/data")
     parser.add_argument(
         "--stage",
         action="append",
         default=[],
         metavar="NAME",
-        help="do this stage alone, and report on it alone; may be given several times",
+        help="do and report this stage alone; may be given several times",
     )
     parser.add_argument(
-        "--dry-run", action="store_true", help="collect and score, then say what would be done"
+        "--dry-run", action="store_true", help="collect and score, then count what is done"
     )
     parser.add_argument(
-        "--no-report", action="store_true", help="results.json alone; needs no matplotlib"
+        "--no-report", action="store_true", help="write results.json alone; needs no matplotlib"
     )
     add_workers(parser)
     parser.set_defaults(jobs=-1)
@@ -70,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     ) as bar:
         task = bar.add_task(plan.name, total=None)
 
-        def said(text: str) -> None:
+        def log(text: str) -> None:
             if not args.json:
                 bar.console.print(text, markup=False, soft_wrap=True)
 
@@ -80,8 +78,8 @@ def run(args: argparse.Namespace) -> int:
             args.data or args.out / "data",
             jobs=args.jobs,
             backend=args.backend,
-            said=said,
-            ticked=lambda what, n, of: bar.update(task, description=what, completed=n, total=of),
+            log=log,
+            ticks=lambda what, n, of: bar.update(task, description=what, completed=n, total=of),
             work=not args.dry_run,
             stages=args.stage,
         )
@@ -124,14 +122,14 @@ def run(args: argparse.Namespace) -> int:
         if len(study.problems) > _SHOWN:
             warn(f"and {len(study.problems) - _SHOWN} more, see {path}")
         if missing:
-            warn(f"{missing} rollouts are missing; the same command again tries what may be tried")
+            warn(f"{missing} rollouts are missing; run the same command again to try them")
         for one in written:
             say(str(one))
     return _DONE if found["budget"]["rollouts"] else _NOTHING
 
 
 def _check_report() -> None:
-    """Better said before an hour of work than after it."""
+    """Refuse a missing matplotlib before an hour of work, not after it."""
     import importlib.util
 
     if importlib.util.find_spec("matplotlib") is None:

@@ -1,4 +1,4 @@
-"""`curation evaluate`: how often a policy succeeds, in our own processes or over the graph."""
+"""`curation evaluate`: how often a policy succeeds, in this process or over the graph."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.errors import ConfigError
 from curation_ros.nodes.evaluate import evaluate_on_graph, summary
 
-_MOST_STEPS = 100_000  # as the sim node has it
+_MOST_STEPS = 100_000  # the limit of sim_node
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--starts", default="official:0:50", help="official:FIRST:END or generated:SEED:COUNT"
     )
-    parser.add_argument("--max-steps", type=int, default=500, help="then a rollout has failed")
+    parser.add_argument(
+        "--max-steps", type=int, help="then a rollout has failed; default: that of sim_node"
+    )
     parser.add_argument(
         "--graph", action="store_true", help="drive sim_node and policy_node over ROS 2"
     )
@@ -34,10 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a row a rollout, then the summary."""
+    """Print a row per rollout, then the summary."""
     from policy_node.policy import load_policy
 
-    if not 1 <= args.max_steps <= _MOST_STEPS:
+    if args.max_steps is not None and not 1 <= args.max_steps <= _MOST_STEPS:
         raise ConfigError(f"--max-steps {args.max_steps}: expected 1 to {_MOST_STEPS}")
     policy = load_policy(args.policy)
     policy.check(topic_map_or_default(""))
@@ -61,13 +63,13 @@ def run(args: argparse.Namespace) -> int:
 def _rollouts(args: argparse.Namespace, policy_id: str) -> Iterator[dict[str, Any]]:
     if args.graph:
         logs = args.logs or Path(tempfile.mkdtemp(prefix="curation_ros-logs-"))
-        if progress_console.is_terminal:  # it takes some seconds until the first row
-            text = f"starting sim_node and policy_node, their logs are in {logs}"
+        if progress_console.is_terminal:  # the first row takes some seconds
+            text = f"starting sim_node and policy_node; their logs are in {logs}"
             progress_console.print(text, markup=False, soft_wrap=True)
         yield from evaluate_on_graph(
             args.policy, policy_id, args.starts, max_steps=args.max_steps, log_folder=logs
         )
-        if args.logs is None:  # after an error they stay: the message names them
+        if args.logs is None:  # after an error they stay, for its message names them
             shutil.rmtree(logs, ignore_errors=True)
         return
     from curation_ros.study.unit_work import roll_policy

@@ -1,4 +1,4 @@
-"""Evaluation of policies on the graph: sim_node and policy_node in lockstep, outcomes counted."""
+"""Evaluates a policy on the graph: sim_node and policy_node in lockstep, one row per rollout."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from curation_ros.core.statistics.intervals import wilson
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.nodes.processes import Domain, Nodes
 
-# A step takes milliseconds; with this much silence something hangs.
+# A step takes milliseconds: without a finished rollout for this long, something hangs.
 _SILENCE_S = 120.0
-# What the transport has lost comes again after 3 s, on a busy machine a second time. A node that
-# has ended is noticed at once.
+# The transport sends a lost message again after 3 s, and on a busy machine a second time. A node
+# that has ended is noticed at once.
 _ANSWER_S = 15.0
 
 
@@ -27,26 +27,26 @@ def evaluate_on_graph(
     policy_id: str,
     starts: str,
     *,
-    max_steps: int = 500,
+    max_steps: int | None = None,
     log_folder: Path,
     stop: threading.Event | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Drive a policy over DDS from each start; the graph runs on a domain of its own.
+    """Drive a policy over DDS from each start, on a domain of its own.
 
     Args:
         policy: folder of the policy.
         policy_id: for the rows.
         starts: as sim_node's parameter `starts`, such as official:0:10.
-        max_steps: after which a rollout has failed.
+        max_steps: after so many steps a rollout has failed; None: the default of sim_node.
         log_folder: for the nodes' logs.
-        stop: set by another thread, ends the evaluation early.
+        stop: ends the evaluation early when another thread sets it.
 
     Yields:
-        A row a rollout as it ends: policy, start, success, steps, stage.
+        A row per rollout when it ends: policy, start, success, steps, stage.
 
     Raises:
-        CurationError: if a node ends or falls silent, or a rollout was not driven to its end: that
-            is no failure of the policy.
+        CurationError: if a node ends or hangs, or a rollout was not driven to its end. None of
+            these is a failure of the policy.
     """
     n = count_starts(starts)
     domain = Domain()
@@ -64,25 +64,25 @@ def evaluate_on_graph(
                     "episodes": n,
                     "starts": starts,
                     "task": "rollout",
-                    "max_steps": max_steps,
+                    **({} if max_steps is None else {"max_steps": max_steps}),
                     "steps_after_success": 0,
                     "command_timeout_s": _ANSWER_S,
                     "dataset": folder,
                     "wait_for": ["policy_node"],
                 },
             )
-            seen, heard_s = 0, time.monotonic()
-            while seen < n and not (stop is not None and stop.is_set()):
+            n_done, last_s = 0, time.monotonic()
+            while n_done < n and not (stop is not None and stop.is_set()):
                 ended = nodes.ended("sim_node") is not None
                 _check_nodes(nodes, log_folder)
                 lines = truth_log.lines()
-                for line in lines[seen:]:
+                for line in lines[n_done:]:
                     yield _row(policy_id, line)
-                if len(lines) > seen:
-                    seen, heard_s = len(lines), time.monotonic()
+                if len(lines) > n_done:
+                    n_done, last_s = len(lines), time.monotonic()
                 elif ended:
-                    raise CurationError(f"sim_node ended after {seen} of {n} rollouts")
-                elif time.monotonic() - heard_s > _SILENCE_S:
+                    raise CurationError(f"sim_node ended after {n_done} of {n} rollouts")
+                elif time.monotonic() - last_s > _SILENCE_S:
                     raise CurationError(
                         f"no rollout has ended for {_SILENCE_S:g} s: see {log_folder}/sim_node.log"
                     )
@@ -93,7 +93,7 @@ def evaluate_on_graph(
 
 
 def _check_nodes(nodes: Nodes, log_folder: Path) -> None:
-    """Complain of a node that has ended too early; of one that refused to run, with its words."""
+    """Raise if a node has ended too early; if it refused to run, with its own message."""
     for node in ("policy_node", "sim_node"):
         code = nodes.ended(node)
         log = log_folder / f"{node}.log"
@@ -106,10 +106,10 @@ def _check_nodes(nodes: Nodes, log_folder: Path) -> None:
 
 
 def count_starts(spec: str) -> int:
-    """Number of starts that a specification names, without building them.
+    """Number of starts of a specification such as official:0:50; none of them is built.
 
     Raises:
-        CurationError: if it is none.
+        CurationError: if it is no specification.
     """
     from sim_node.starts import start_names
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def collect_datasets(
-    folder: Path, plan: StudyPlan, *, jobs: int, backend: str, said: Callable[[str], None]
+    folder: Path, plan: StudyPlan, *, jobs: int, backend: str, log: Callable[[str], None]
 ) -> tuple[dict[str, Dataset], int]:
     """Collect the missing demonstrations of all datasets of a plan.
 
@@ -24,7 +24,7 @@ def collect_datasets(
         plan: of the study.
         jobs: number of workers.
         backend: kind of the workers.
-        said: called with a line about each dataset.
+        log: called with a line about each dataset.
 
     Returns:
         Datasets by name, and the number of newly collected demonstrations.
@@ -47,7 +47,7 @@ def collect_datasets(
                 problems.append(f"{one.name}: {one.problem}")
         if problems:
             raise CurationError(f"dataset {folder / name}: {'; '.join(problems)}")
-        said(f"dataset {name}: {n} demonstrations, {n_known} of them collected before")
+        log(f"dataset {name}: {n} demonstrations, {n_known} of them collected before")
         datasets[name] = Dataset(folder / name)
         n_new += n - n_known
     return datasets, n_new

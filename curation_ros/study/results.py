@@ -1,4 +1,4 @@
-"""Results of a study: counts, and what they can say; plain data for the reports and for people."""
+"""Results of a study as plain data: counts, with the statistics that they support."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _PACKAGES = (
     *("torch", "numba"),
 )
 
-#: Roles of the fields that a picture of an episode is drawn from.
+#: Roles of the fields that are drawn in the picture of an episode.
 _SHOWN = ("effector", "object", "gripper", "phase")
-#: Needs that everybody can meet who has the demonstrations.
+#: Needs that cost nothing beyond the demonstrations.
 _FREE = {"nothing", "dataset"}
 
 
 def results(study: Study) -> Row:
-    """All that a study has found, as `results.json` holds it; docs/study.md names the keys."""
+    """The content of `results.json`; docs/study.md names the keys."""
     plan, trials = study.plan, study.trials
     rollouts = {
         (r["policy"], r["start"]): r for r in trials.rows("rollout") if r["status"] == "ok"
@@ -101,14 +101,14 @@ def _versions() -> dict[str, str]:
 
 
 def _left_out(plan: StudyPlan) -> list[str]:
-    """Stages of the plan that were not asked for."""
+    """Names of the stages of the plan that were left out by `--stage`."""
     done = {stage.name for stage in plan.stages}
     names = [str(stage["name"]) for stage in plan.raw["stages"]]
     return [name for name in names if name not in done]
 
 
 def _example(study: Study) -> Row:
-    """A salvaged episode, with its decision: what the report's picture is drawn from."""
+    """A salvaged episode with its decision, for the picture in the report."""
     for name, pool in study.pools.items():
         if pool.curated is None or pool.curated.example is None:
             continue
@@ -128,7 +128,7 @@ def _example(study: Study) -> Row:
 
 
 def _keep(row: str) -> int | None:
-    """How many a row keeps of the pool, where it says a number."""
+    """How many demonstrations of the pool a row keeps; None where it names no number."""
     counts = (t.keep for t in parse_row(row) if t.name != "more" and t.keep is not None)
     return next(counts, None)
 
@@ -193,7 +193,7 @@ def _row(
     terms = parse_row(cell.row)
     scorer = next((t.name for t in terms if is_scorer(t.name)), "")
     audited: Mapping[str, Any] = next((r for r in pool.audited if r["scorer"] == scorer), {})
-    # What is ranked by: the score under length control, but for the baseline of length itself.
+    # Rows are ranked by the score under length control, and `length` by the raw one.
     raw = is_scorer(scorer) and not find_scorer(scorer).length_controlled
     row: Row = {
         "variant": cell.variant,
@@ -239,7 +239,7 @@ def _row(
 
 
 def _sets(cell: Cell, timelines: Mapping[str, Episode]) -> Row:
-    """What is in the training set; of one that is drawn for each seed the means, and no ids."""
+    """Content of the training set; means without ids if it is drawn again for each seed."""
     different = {made.id: made for made in cell.sets.values()}
     described = [made.to_json(timelines) for made in different.values()]
     first = described[0]
@@ -266,7 +266,7 @@ def _counted(values: Iterable[str]) -> dict[str, int]:
 
 
 def _compare(rows: list[Row]) -> None:
-    """Add the gap closed, and the best row that needs no more than each scorer's."""
+    """Add the gap closed, and for each scorer the best row without one that needs no more."""
     for row in rows:
         same = [r for r in rows if (r["pool"], r["variant"]) == (row["pool"], row["variant"])]
         rates = {r["row"]: r["rate"] for r in same}
@@ -278,7 +278,7 @@ def _compare(rows: list[Row]) -> None:
         if not row["scorer"] or row["rate"] is None:
             continue
         own = set(row["needs"]) - _FREE
-        # The best of many draws is luck: those of one number kept count as one row, their mean.
+        # The best of many draws is luck: draws of the same size count as one row, their mean.
         rivals: dict[str, list[float]] = {}
         for r in same:
             counts = r["rate"] is not None and not r["scorer"] and r["set"] != row["set"]
@@ -320,7 +320,7 @@ def _contrasts(
     outcomes: Mapping[tuple[str, str, str], Outcomes],
     rows: Sequence[Row],
 ) -> list[Row]:
-    """Planned comparisons, adjusted for how many were planned; one without data counts."""
+    """Planned comparisons, adjusted for their number; those without data count, too."""
     found: list[Row] = []
     p_values: dict[str, float | None] = {}
     sets = {(r["pool"], r["variant"], r["row"]): r["set"] for r in rows}

@@ -1,4 +1,4 @@
-"""Runs a study: collects, scores, trains and rolls out what its plan says and is not done yet."""
+"""Runs a study: collects, scores, trains and rolls out what its plan names and is not done yet."""
 
 from __future__ import annotations
 
@@ -21,22 +21,23 @@ from curation_ros.study.training_sets import TrainingSet, training_set
 from curation_ros.study.trials import PolicyTrials, Work
 from curation_ros.study.units import PolicyUnit, RolloutUnit, Row
 
-Said = Callable[[str], None]
-#: What is told of a unit that was done: which stage, what kind, how many of how many.
-Ticked = Callable[[str, int, int], None]
-# Training sets that are trained on before they are rolled out.
+#: Called with a line about each part of a study.
+Log = Callable[[str], None]
+#: Called for each unit that was done: a label, how many are done, and of how many.
+Ticks = Callable[[str, int, int], None]
+# So many training sets are trained on, then rolled out, then the next ones.
 _CELLS = 16
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A training set with a variant of the observations in a stage, and its policies.
+    """A training set and a variant in a stage, with a policy per training seed.
 
     Attributes:
         stage: of the plan.
-        variant: of the observations.
-        sets: training seed -> what its policy learns from: the same for all, but for controls
-            that are drawn anew for each seed.
+        variant: name of what the policies observe and command.
+        sets: training seed -> what its policy learns from. All are the same set, except for
+            controls that are drawn again for each seed.
     """
 
     stage: Stage
@@ -50,7 +51,7 @@ class Cell:
 
     @property
     def row(self) -> str:
-        """What the plan calls the training set."""
+        """Name of the training set in the plan."""
         return next(iter(self.sets.values())).row
 
     @property
@@ -64,7 +65,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Study:
-    """A study as far as it has come.
+    """A study, complete or not.
 
     Attributes:
         plan: of it.
@@ -72,10 +73,10 @@ class Study:
         pools: by name, scored.
         reference: trusted demonstrations.
         cells: all of the plan, in its order.
-        problems: what failed or was not begun, a line each.
-        seconds: what took how long, in all runs so far.
-        n_reference: trusted demonstrations, how many.
-        timelines: id -> demonstration, its phases and stamps alone.
+        problems: what failed or was not begun, one line each.
+        seconds: duration of each part, in all runs so far.
+        n_reference: number of trusted demonstrations.
+        timelines: id -> demonstration with its phases and stamps alone.
     """
 
     plan: StudyPlan
@@ -96,36 +97,36 @@ def run_study(
     *,
     jobs: int = 1,
     backend: str = "loky",
-    said: Said = lambda text: None,
-    ticked: Ticked = lambda what, done, of: None,
+    log: Log = lambda text: None,
+    ticks: Ticks = lambda label, done, of: None,
     work: bool = True,
     stages: Sequence[str] = (),
 ) -> Study:
-    """Do what a plan says and an earlier run has not done.
+    """Do what a plan names and no earlier run has done.
 
     Args:
         plan: what to do.
         folder: of the study: policies, `units.jsonl`, `seconds.jsonl`.
-        data: where the datasets are, or are collected; studies may share them.
+        data: folder of the datasets, which are collected if they are missing; studies may share
+            them.
         jobs: workers.
         backend: of the workers.
-        said: called with a line about each part.
-        ticked: called as units are done.
-        work: whether to train and roll out; False: only take stock.
-        stages: those to do, and to take stock of; none: all.
+        log: called with a line about each part.
+        ticks: called for each unit that is done.
+        work: whether to train and roll out; False: only count what is done.
+        stages: names of the stages to do and to count; empty: all.
 
     Raises:
-        ConfigError: if the plan makes no sense or is not the one that the folder was begun with.
+        ConfigError: if the plan makes no sense, or differs from the one that the folder was begun
+            with.
         CurationError: if a dataset cannot be completed or scored, or a file cannot be written.
     """
     check_starts(plan)
     if stages:
         plan = plan.only(stages)
-    clock = _Clock(folder / "seconds.jsonl", notes=work)
+    clock = _Clock(folder / "seconds.jsonl", writes=work)
     with clock.measured("collect") as fact:
-        datasets, fact["units"] = collect_datasets(
-            data, plan, jobs=jobs, backend=backend, said=said
-        )
+        datasets, fact["units"] = collect_datasets(data, plan, jobs=jobs, backend=backend, log=log)
     reference = read_all_episodes(datasets["reference"], "reference")
     timelines = {e.id: timeline_of(e) for e in reference}
     if "more" in datasets:
@@ -136,7 +137,7 @@ def run_study(
         for name in plan.pools:
             pools[name] = score_pool(name, datasets[name], reference, plan)
             timelines |= pools[name].timelines
-            said(f"pool {name}: {len(plan.scorers)} scorers, {pools[name].facts['n']} scored")
+            log(f"pool {name}: {len(plan.scorers)} scorers, {pools[name].facts['n']} scored")
     trials = PolicyTrials(
         folder,
         jobs=jobs,
@@ -146,14 +147,14 @@ def run_study(
         budget_steps=plan.budget_steps,
     )
     cells = tuple(_cells(plan, pools, datasets["reference"], datasets.get("more")))
-    said(
+    log(
         f"{len(cells)} cells, {len({p for c in cells for p in c.policies.values()})} policies; "
         f"{trials.used_steps} of {plan.budget_steps} simulation steps are used"
     )
     found: list[str] = []
     for label, part in _parts(cells) if work else ():
-        found += _train(trials, plan, part, label, clock, said, ticked)
-        found += _roll(trials, part, label, clock, said, ticked)
+        found += _train(trials, plan, part, label, clock, log, ticks)
+        found += _roll(trials, part, label, clock, log, ticks)
     return Study(
         plan=plan,
         trials=trials,
@@ -187,7 +188,7 @@ def _cells(
 
 
 def _parts(cells: tuple[Cell, ...]) -> Iterator[tuple[str, list[Cell]]]:
-    """Cells that are trained and then rolled out, and what they are: a run cut short has both."""
+    """Cells that are trained and then rolled out, with a label: a run cut short has both."""
     parts: dict[tuple[str, str, str], list[Cell]] = {}
     for cell in cells:
         parts.setdefault((cell.stage.name, cell.pool, cell.variant), []).append(cell)
@@ -202,8 +203,8 @@ def _train(
     cells: list[Cell],
     label: str,
     clock: _Clock,
-    said: Said,
-    ticked: Ticked,
+    log: Log,
+    ticks: Ticks,
 ) -> list[str]:
     units = {
         cell.policies[seed]: PolicyUnit(
@@ -222,17 +223,17 @@ def _train(
     def tick(row: Row) -> None:
         nonlocal n
         n += 1
-        ticked(f"{label}: trained", n, len(units))
+        ticks(f"{label}: trained", n, len(units))
 
     with clock.measured("train", label) as fact:
         work = trials.train(list(units.values()), tick)
         fact["units"] = len(work.done)
-    said(f"{label}: {len(work.done)} policies trained, {work.known} known, {len(work.failed)} not")
+    log(f"{label}: {len(work.done)} policies trained, {work.known} known, {len(work.failed)} not")
     return [f"policy {row['policy']}: {row['reason']}" for row in work.failed]
 
 
 def _roll(
-    trials: PolicyTrials, cells: list[Cell], label: str, clock: _Clock, said: Said, ticked: Ticked
+    trials: PolicyTrials, cells: list[Cell], label: str, clock: _Clock, log: Log, ticks: Ticks
 ) -> list[str]:
     from sim_node.starts import start_names
 
@@ -247,13 +248,13 @@ def _roll(
     def tick(row: Row) -> None:
         nonlocal n
         n += 1
-        ticked(f"{label}: rolled out", n, wanted)
+        ticks(f"{label}: rolled out", n, wanted)
 
     with clock.measured("roll", label) as fact:
         work: Work = trials.roll(units, tick)
         fact["units"] = len(work.done)
         fact["steps"] = sum(int(row["steps"]) for row in work.done)
-    said(
+    log(
         f"{label}: {len(work.done)} rollouts done, {work.known} known, "
         f"{len(work.failed) + len(work.missing)} not"
     )
@@ -262,22 +263,22 @@ def _roll(
 
 
 class _Clock:
-    """Wall time of each part of each run, in a file."""
+    """Wall time of each part of each run, kept in a file."""
 
-    def __init__(self, path: Path, notes: bool) -> None:
-        self._path, self._notes = path, notes
+    def __init__(self, path: Path, writes: bool) -> None:
+        self._path, self._writes = path, writes
 
     @contextmanager
     def measured(self, what: str, part: str = "") -> Iterator[Row]:
-        """Measure a part, and note it where it has done something; facts may be added."""
+        """Measure a part, and write it down if it did something; the caller may add facts."""
         row: Row = {"what": what, "part": part}
         began_s = time.monotonic()
         yield row
         row["seconds"] = round(time.monotonic() - began_s, 2)
-        if self._notes and row.get("units", 1):
+        if self._writes and row.get("units", 1):
             with named_errors(self._path):
                 append_line(self._path, row)
 
     def all(self) -> list[Row]:
-        """What was noted, oldest first."""
+        """All parts of all runs, oldest first."""
         return read_lines(self._path)

@@ -15,6 +15,7 @@ from policy_node.policy import load_policy
 from policy_node.rollouts import Rollout, rollout
 from policy_node.settings import TrainingSettings
 from sim_node.env import process_env
+from sim_node.episodes import MAX_STEPS
 from sim_node.starts import start_by_name
 
 
@@ -23,18 +24,19 @@ def policy_folder(study: Path, policy_id: str) -> Path:
     return study / "policies" / policy_id
 
 
-def roll_policy(policy: Path, start: str, max_steps: int) -> Rollout:
+def roll_policy(policy: Path, start: str, max_steps: int | None) -> Rollout:
     """One rollout, in the environment of this process.
 
     Args:
         policy: folder of the policy.
         start: its name.
-        max_steps: most commands.
+        max_steps: most commands; None: the default of the simulator.
 
     Raises:
         ConfigError, PolicyError, SimError: as `policy_node.rollouts.rollout` does.
     """
-    return rollout(process_env(), start_by_name(start), load_policy(policy), max_steps)
+    limit = MAX_STEPS if max_steps is None else max_steps
+    return rollout(process_env(), start_by_name(start), load_policy(policy), limit)
 
 
 def roll_units(

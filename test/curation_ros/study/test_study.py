@@ -133,7 +133,7 @@ def test_sets_hold_what_their_names_say(study: Study) -> None:
 def test_equal_sets_are_trained_once(study: Study, found: dict[str, Any]) -> None:
     rows = rows_of(found)
     assert rows["oracle"]["set"] == rows["gripper_timing@2"]["set"]
-    trained = [row["policy"] for row in study.judge.rows("policy")]
+    trained = [row["policy"] for row in study.trials.rows("policy")]
     assert len(trained) == len(set(trained)) == found["budget"]["policies"]
     assert len(trained) < sum(len(row["outcomes"]) for row in rows.values())
     contrast = found["stages"][0]["contrasts"][1]
@@ -156,9 +156,9 @@ def test_rivals_need_no_more_than_the_scorer(found: dict[str, Any]) -> None:
 
 
 def test_a_second_run_does_nothing_twice(study: Study, data: Path, found: dict[str, Any]) -> None:
-    log = (study.judge.folder / "units.jsonl").read_bytes()
-    again = run_study(PLAN, study.judge.folder, data)
-    assert (study.judge.folder / "units.jsonl").read_bytes() == log
+    log = (study.trials.folder / "units.jsonl").read_bytes()
+    again = run_study(PLAN, study.trials.folder, data)
+    assert (study.trials.folder / "units.jsonl").read_bytes() == log
     fresh = json.loads(json.dumps(results(again)))
     assert {**fresh, "created_at": "", "seconds": []} == {
         **found,
@@ -250,7 +250,7 @@ def test_a_dry_run_says_how_much_is_done(
     command = ["benchmark", "--dry-run", "--config", str(plan), "--data", str(data), "--json"]
     assert main([*command, "--out", str(tmp_path)]) == 0
     said = json.loads(capsys.readouterr().out)
-    n = len({row["policy"] for row in study.judge.rows("policy")})
+    n = len({row["policy"] for row in study.trials.rows("policy")})
     assert said == {"policies": n, "trained": 0, "rollouts": 0}
     assert not (tmp_path / "small" / "results.json").exists()
 
@@ -265,7 +265,7 @@ def test_the_command_names_a_plan_that_is_none(
 def test_a_study_of_other_rules_is_not_mixed_in(data: Path, study: Study) -> None:
     plan: StudyPlan = plan_from({**RAW, "gives_up": False})
     with pytest.raises(ConfigError, match="have gives_up True, not False"):
-        run_study(plan, study.judge.folder, data)
+        run_study(plan, study.trials.folder, data)
 
 
 # --- what the curator decides -------------------------------------------------------------------
