@@ -32,7 +32,6 @@ import numpy as np
 from numpy.typing import NDArray
 from one_core import rows_of
 
-from curation_ros.core.episode.phases import PHASES
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.episodes import read_episode
 from curation_ros.study.collect import Collection, collect
@@ -42,11 +41,12 @@ from policy_node.rollouts import SimController, rollout
 from policy_node.settings import TrainingSettings
 from policy_node.train import train
 from sim_node.defects import DEFECTS, Defect
-from sim_node.env import BOWL, LiberoEnv
 from sim_node.environment import GRIPPER_CLOSE, GRIPPER_OPEN, Command
-from sim_node.episodes import EpisodeLimits, EpisodeResult, run_episode
-from sim_node.expert import Expert
-from sim_node.starts import Start, generated_start, official_start
+from sim_node.episodes import EpisodeResult, run_episode
+from sim_node.libero.env import LiberoEnv
+from sim_node.settings import EpisodeLimits
+from sim_node.starts import Start, generated_name, official_name
+from sim_node.tasks.bowl_on_plate import BOWL, TASK
 from sim_node.tasks.task import Controller, Step
 
 COMMAND = "python benchmarks/run.py closed_loop"
@@ -138,7 +138,7 @@ def recorded_states(env: LiberoEnv, start: Start, policy: Policy) -> list[Floats
         mujoco.mj_getState(env.model, env.data, states[-1], kind)
 
     limits = EpisodeLimits(steps_after_success=0)
-    run_episode(env, start, SimController(policy), limits, on_step=remember)
+    run_episode(env, TASK, start, SimController(policy), limits, on_step=remember)
     return states
 
 
@@ -157,7 +157,7 @@ def bare_rate(model: mujoco.MjModel, data: mujoco.MjData, states: list[Floats]) 
 def loop_rate(env: LiberoEnv, start: Start, policy: Policy, max_steps: int = MAX_STEPS) -> float:
     """Steps a second of a rollout, its reset not counted."""
     started_s = time.perf_counter()
-    done = rollout(env, start, policy, max_steps)
+    done = rollout(env, TASK, start, policy, max_steps)
     return done.steps / (time.perf_counter() - started_s - env.reset_s)
 
 
@@ -166,7 +166,7 @@ def speed_rows(lean: LiberoEnv, stock: LiberoEnv, policy: Policy) -> list[dict[s
     rates: dict[str, list[float]] = {"stock": [], "lean": [], "bare": []}
     data = mujoco.MjData(lean.model)
     for k in range(N_ROUNDS):
-        start = generated_start(_SEED_SPEED, k)
+        start = TASK.start(generated_name(_SEED_SPEED, k))
         states = recorded_states(lean, start, policy)
         ways: dict[str, Callable[[], float]] = {
             "lean": partial(loop_rate, lean, start, policy),
@@ -209,9 +209,10 @@ def speed_rows(lean: LiberoEnv, stock: LiberoEnv, policy: Policy) -> list[dict[s
 def n_compiled() -> int:
     """Functions that a fresh interpreter compiles before it steps, with no program on its path."""
     code = (
-        "from sim_node.env import LiberoEnv; from sim_node.starts import official_start;"
-        "from sim_node import osc;"
-        "env = LiberoEnv(); env.reset(official_start(0).state); env.step([0.1, 0.0, 0.0], 1.0);"
+        "from sim_node.tasks.bowl_on_plate import TASK;"
+        "from sim_node.libero import osc;"
+        "env = TASK.environment(); env.reset(TASK.start('official-00').state);"
+        "env.step([0.1, 0.0, 0.0], 1.0);"
         "functions = [f for f in vars(osc).values() if hasattr(f, 'stats')];"
         "assert len(functions) == 3, functions;"
         "print(sum(sum(f.stats.cache_misses.values()) for f in functions))"
@@ -228,7 +229,7 @@ def n_compiled() -> int:
 
 def scripted(defect: Defect, seed: int) -> Controller:
     """An expert with a defect."""
-    return defect.inject(Expert(seed), seed)
+    return defect.inject(TASK.expert(seed), TASK, seed)
 
 
 def pairs(clean: Policy, contaminated: Policy) -> Iterator[Pair]:
@@ -237,7 +238,7 @@ def pairs(clean: Policy, contaminated: Policy) -> Iterator[Pair]:
         for k in range(first, first + N_SCRIPTED):
             yield Pair(
                 "expert" if defect.name == "none" else defect.name,
-                generated_start(_SEED_PAIRED, k),
+                TASK.start(generated_name(_SEED_PAIRED, k)),
                 partial(scripted, defect, k),
                 steps_after_success=20,
             )
@@ -245,7 +246,7 @@ def pairs(clean: Policy, contaminated: Policy) -> Iterator[Pair]:
         for k in range(N_SCRIPTED // 2):
             yield Pair(
                 kind,
-                official_start(k),
+                TASK.start(official_name(k)),
                 partial(SimController, policy),
                 steps_after_success=0,
             )
@@ -262,6 +263,7 @@ def run_pair(env: LiberoEnv, pair: Pair) -> Run:
 
     result = run_episode(
         env,
+        TASK,
         pair.start,
         pair.controller(),
         EpisodeLimits(MAX_STEPS, pair.steps_after_success),
@@ -319,7 +321,7 @@ class Comparison:
             different = np.flatnonzero(apart_m > DIFFERENT_M)
             if len(different):
                 first = int(different[0])
-                phase = PHASES[a.phases[min(first, len(a.phases) - 1)]]
+                phase = TASK.phases[a.phases[min(first, len(a.phases) - 1)]]
                 since.append(f"{what} apart since step {first} ({phase})")
         one, other = a.result, b.result
         is_outcome = (one.is_success, one.stage) == (other.is_success, other.stage)
@@ -411,7 +413,7 @@ def measure(dataset: Path | None, parts: Sequence[str]) -> Iterator[dict[str, An
             for collected in collect(dataset, _DEMONSTRATIONS):
                 assert not collected.problem, collected
         clean, contaminated = policies(Dataset(dataset))
-    with LiberoEnv() as lean, LiberoEnv(lean=False) as stock:
+    with TASK.environment() as lean, TASK.environment(lean=False) as stock:
         if "speed" in parts:
             yield from speed_rows(lean, stock, clean)
             compiled = n_compiled()

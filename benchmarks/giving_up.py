@@ -24,10 +24,10 @@ from curation_ros.study.units import named_variant
 from policy_node.policy import load_policy
 from policy_node.rollouts import GiveUp, SimController
 from policy_node.train_many import FailedTraining, TrainingJob, train_many
-from sim_node.env import process_env
 from sim_node.environment import Command
-from sim_node.episodes import EpisodeLimits, run_episode
-from sim_node.starts import start_by_name
+from sim_node.episodes import run_episode
+from sim_node.settings import SIMULATED_TASK, EpisodeLimits
+from sim_node.tasks import TASKS, process_environment
 from sim_node.tasks.task import Step
 
 #: How many good and how many bad demonstrations a policy learns from.
@@ -54,7 +54,8 @@ def train(data: Path, out: Path, good: int, bad: int, variant: str) -> Path:
 
 def watch(policy: Path, start: str) -> dict[str, Any]:
     """A whole rollout, and when and why it would have been given up."""
-    give_up = GiveUp()
+    task = TASKS[SIMULATED_TASK]
+    give_up = GiveUp(task)
     said: list[tuple[int, str]] = []
 
     def look(step: Step, _: Command) -> None:
@@ -64,8 +65,9 @@ def watch(policy: Path, start: str) -> dict[str, Any]:
 
     controller = SimController(load_policy(policy))
     ended = run_episode(
-        process_env(),
-        start_by_name(start),
+        process_environment(task.name),
+        task,
+        task.start(start),
         controller,
         EpisodeLimits(steps_after_success=0),
         on_step=look,

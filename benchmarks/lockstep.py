@@ -31,7 +31,6 @@ from recorded import record
 from rows import row
 from sensor_msgs.msg import JointState
 
-from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.episode.status import phase_to_status
 from curation_ros.core.episode.stream import header_stamp_ns
 from curation_ros.core.types import NS_PER_S
@@ -156,22 +155,23 @@ def _on_graph(folder: Path, name: str, starts: str) -> list[Any]:
 
 def _in_process(policy: Any, starts: str) -> list[Any]:
     from policy_node.rollouts import SimController
-    from sim_node.env import LiberoEnv
-    from sim_node.episodes import EpisodeLimits, run_episode
-    from sim_node.starts import parse_starts
+    from sim_node.episodes import run_episode
+    from sim_node.settings import SIMULATED_TASK, EpisodeLimits
+    from sim_node.tasks import TASKS, process_environment, start_names
 
     times = []
-    with LiberoEnv() as env:
-        for start in parse_starts(starts):
-            clock: list[float] = []
-            run_episode(
-                env,
-                start,
-                SimController(policy),
-                EpisodeLimits(MAX_STEPS, steps_after_success=0),
-                on_step=lambda *_, clock=clock: clock.append(time.perf_counter()),
-            )
-            times.append(np.diff(clock)[1:])
+    task = TASKS[SIMULATED_TASK]
+    for start in start_names(starts):
+        clock: list[float] = []
+        run_episode(
+            process_environment(task.name),
+            task,
+            task.start(start),
+            SimController(policy),
+            EpisodeLimits(MAX_STEPS, steps_after_success=0),
+            on_step=lambda *_, clock=clock: clock.append(time.perf_counter()),
+        )
+        times.append(np.diff(clock)[1:])
     return times
 
 
@@ -236,7 +236,7 @@ def _ask() -> None:
             elif kind is PoseStamped:
                 message = pose_to_ros(numbers[:3], numbers[:4], k)
             else:
-                message = array_to_ros([phase_to_status("", PHASES[0], 0, 0.5)], k)
+                message = array_to_ros([phase_to_status("", "PREGRASP", 0, 0.5)], k)
             side.out[topic].publish(message)
         side.wait(k)
         times.append(time.perf_counter() - began_s)

@@ -13,8 +13,8 @@ import sys
 import time
 from typing import Any
 
-from sim_node.env import LiberoEnv
-from sim_node.starts import generated_start
+from sim_node.settings import SIMULATED_TASK
+from sim_node.tasks import TASKS
 
 COMMAND = "python benchmarks/run.py sim_speed"
 N_RESETS = 7
@@ -24,8 +24,8 @@ N_STARTS = 3
 def fresh_start_s(lean: bool) -> float:
     """Seconds from a fresh interpreter to the first observation, with warm caches."""
     code = (
-        "from sim_node.env import LiberoEnv; from sim_node.starts import official_start; "
-        f"LiberoEnv(lean={lean}).reset(official_start(0).state)"
+        f"from sim_node.tasks import TASKS; task = TASKS[{SIMULATED_TASK!r}]; "
+        f"task.environment(lean={lean}).reset(task.start('official-00').state)"
     )
     started_s = time.perf_counter()
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -35,12 +35,15 @@ def fresh_start_s(lean: bool) -> float:
 def reset_s() -> dict[bool, list[float]]:
     """Seconds of each reset, settling included, by whether the path is lean."""
     seconds: dict[bool, list[float]] = {True: [], False: []}
-    with LiberoEnv() as lean, LiberoEnv(lean=False) as stock:
-        for k in range(N_RESETS + 1):
-            for env in (lean, stock):
-                env.reset(generated_start(0, k).state)
-                if k > 0:  # the first one warms up
-                    seconds[env.lean].append(env.reset_s)
+    task = TASKS[SIMULATED_TASK]
+    environments = {lean: task.environment(lean=lean) for lean in (True, False)}
+    for k in range(N_RESETS + 1):
+        for lean, env in environments.items():
+            state = task.start(f"generated-0-{k:03d}").state
+            started_s = time.perf_counter()
+            env.reset(state)
+            if k > 0:  # the first one warms up
+                seconds[lean].append(time.perf_counter() - started_s)
     return seconds
 
 

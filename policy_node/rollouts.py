@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.types import Floats
 from policy_node.controller import PolicyController
 from policy_node.policy import Policy
-from sim_node.env import BOWL, PLATE, LiberoEnv
 from sim_node.environment import Environment, Observation
-from sim_node.episodes import MAX_STEPS, EpisodeLimits, run_episode
+from sim_node.episodes import run_episode
+from sim_node.settings import MAX_STEPS, EpisodeLimits
 from sim_node.starts import Start
-from sim_node.tasks.task import Step
+from sim_node.tasks.bowl_on_plate import BOWL, PLATE
+from sim_node.tasks.task import Step, Task
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,10 @@ class GiveUp:
     _REST_STEPS, _REST_M = 20, 1e-3
     _ON_TABLE_M, _OUT_OF_REACH_M, _OFF_GOAL_M = 0.02, 0.12, 0.06
 
-    def __init__(self) -> None:
+    def __init__(self, task: Task) -> None:
+        self._names = task.moved_object, task.goal_object
+        self._carry_index = task.phases.index(task.carry_phases[0])
+        self._last_index = len(task.phases) - 1
         self._height_m = 0.0
         self._phase = -1
         self._phase_steps = 0
@@ -99,25 +101,25 @@ class GiveUp:
     def __call__(self, step: Step) -> str:
         """Why to end before this step; empty: go on."""
         if step.index == 0:
-            self._height_m = float(step.observation.objects[BOWL][0][2])
+            self._height_m = float(step.observation.objects[self._names[0]][0][2])
         self._phase_steps = self._phase_steps + 1 if step.phase_index == self._phase else 1
         self._phase = step.phase_index
-        is_last = self._phase == len(PHASES) - 1
+        is_last = self._phase == self._last_index
         if self._phase_steps > (self.RELEASE_STEPS if is_last else self.PHASE_STEPS):
             return "phase"
         return "lost" if self._is_lost(step) else ""
 
     def _is_lost(self, step: Step) -> bool:
-        bowl, plate = (step.observation.objects[name][0] for name in (BOWL, PLATE))
+        moved, goal = (step.observation.objects[name][0] for name in self._names)
         if not (
-            self._phase >= PHASES.index("LIFT")
-            and bowl[2] < self._height_m + self._ON_TABLE_M
-            and np.linalg.norm(bowl - step.observation.eef_position_m) > self._OUT_OF_REACH_M
-            and np.linalg.norm(bowl[:2] - plate[:2]) > self._OFF_GOAL_M
+            self._phase >= self._carry_index
+            and moved[2] < self._height_m + self._ON_TABLE_M
+            and np.linalg.norm(moved - step.observation.eef_position_m) > self._OUT_OF_REACH_M
+            and np.linalg.norm(moved[:2] - goal[:2]) > self._OFF_GOAL_M
         ):
             self._lying.clear()
             return False
-        self._lying.append(bowl)
+        self._lying.append(moved)
         recent = self._lying[-self._REST_STEPS :]
         return len(recent) == self._REST_STEPS and bool(
             np.ptp(recent, axis=0).max() < self._REST_M
@@ -126,6 +128,7 @@ class GiveUp:
 
 def rollout(
     env: Environment,
+    task: Task,
     start: Start,
     policy: Policy,
     max_steps: int = MAX_STEPS,
@@ -136,6 +139,7 @@ def rollout(
 
     Args:
         env: reset by this function.
+        task: what is to be done in it.
         start: where to start.
         policy: what acts.
         max_steps: most commands.
@@ -148,44 +152,13 @@ def rollout(
     """
     result = run_episode(
         env,
+        task,
         start,
         SimController(policy),
         EpisodeLimits(max_steps, steps_after_success=0),
-        give_up=GiveUp() if gives_up else None,
+        give_up=GiveUp(task) if gives_up else None,
     )
     ended = "success" if result.is_success else result.given_up or "max_steps"
     return Rollout(
         policy.card.id, start.name, result.is_success, result.n_steps, result.stage, ended
     )
-
-
-def evaluate(
-    policy: Policy,
-    starts: Iterable[Start],
-    env: Environment | None = None,
-    max_steps: int = MAX_STEPS,
-    progress: Callable[[Rollout], None] | None = None,
-) -> list[Rollout]:
-    """One rollout a start, in their order.
-
-    Args:
-        policy: what acts.
-        starts: where to start.
-        env: default: one of its own, closed at the end.
-        max_steps: most commands a rollout.
-        progress: called after each rollout.
-
-    Raises:
-        ConfigError, PolicyError, SimError: as `rollout` does.
-    """
-    simulator: Environment = LiberoEnv() if env is None else env
-    try:
-        rollouts = []
-        for start in starts:
-            rollouts.append(rollout(simulator, start, policy, max_steps))
-            if progress is not None:
-                progress(rollouts[-1])
-        return rollouts
-    finally:
-        if env is None:
-            simulator.close()

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -20,17 +20,15 @@ from curation_ros.core.errors import SimError
 from curation_ros.core.types import NS_PER_S
 from sim_node.defects import DefectiveController
 from sim_node.environment import Command, Environment
-from sim_node.episodes import MAX_STEPS, STEPS_AFTER_SUCCESS, EpisodeLimits, Pilot, Run
+from sim_node.episodes import Pilot, Run
 from sim_node.messages import COMMAND_TOPICS, GRIPPER_JOINT, RobotMessages, command_messages
 from sim_node.planning import EpisodePlan
+from sim_node.settings import DriveSettings
 from sim_node.starts import Start
-from sim_node.tasks.task import Step
+from sim_node.tasks.task import Step, Task
 
 #: Yields to the executor until its result is there; True asks to be resumed at once.
 CommandScript = Generator[bool, None, Command]
-
-#: As LIBERO names it.
-TASK = "libero_spatial/0"
 
 _REPEAT_S = 0.5
 _CHECK_S = 1.0
@@ -40,40 +38,6 @@ _CONFIRM_S = 10.0
 
 class AbortedError(Exception):
     """The running episode cannot go on; the message says why."""
-
-
-@dataclass(frozen=True)
-class DriveSettings:
-    """How episodes are driven; the attributes are parameters of the sim node.
-
-    Attributes:
-        mode: `expert`: the scripted expert gives the commands; `command`: messages do.
-        sync: `lockstep`: step when the command is there; `free`: step once per control period.
-        max_steps: most commands of an episode.
-        max_steps_defective: the same for episodes with a defect; 0: max_steps.
-        steps_after_success: commands after the one that succeeded.
-        realtime_factor: speed in `free`, 1 is real time.
-        hold_timeout_s: in `free`, a command older than this counts as zero.
-        command_timeout_s: in `lockstep`, longest wait for a command.
-    """
-
-    mode: Literal["expert", "command"] = "expert"
-    sync: Literal["lockstep", "free"] = "lockstep"
-    max_steps: int = MAX_STEPS
-    max_steps_defective: int = 0
-    steps_after_success: int = STEPS_AFTER_SUCCESS
-    realtime_factor: float = 1.0
-    hold_timeout_s: float = 0.5
-    command_timeout_s: float = 5.0
-
-    def limits(self, defect: str) -> EpisodeLimits:
-        """When an episode with this defect ends.
-
-        Raises:
-            ConfigError: if a number is out of range.
-        """
-        steps = self.max_steps if defect == "none" else self.max_steps_defective or self.max_steps
-        return EpisodeLimits(steps, self.steps_after_success)
 
 
 class Output(Protocol):
@@ -179,6 +143,7 @@ class DrivenEpisode:
     Attributes:
         id: uuid of the episode.
         name: short name.
+        task: what was to be done.
         plan: what was planned.
         start_ns: stamp of the first observation.
         run: the loop.
@@ -189,6 +154,7 @@ class DrivenEpisode:
 
     id: str
     name: str
+    task: Task
     plan: EpisodePlan
     start_ns: int
     run: Run
@@ -212,7 +178,7 @@ class DrivenEpisode:
             "success_step": self.run.success_step,
             "stage": self.run.stage,
             "aborted": self.reason,
-            "task": TASK,
+            "task": self.task.benchmark_id,
             "start": self.plan.start,
             "repetition": self.plan.repetition,
             "expert_seed": self.plan.expert_seed,
@@ -225,6 +191,7 @@ class Driver:
 
     Args:
         env: the simulator.
+        task: what is to be done in it.
         out: where observations, commands and events go.
         commands: filled by the node's subscriptions.
         settings: how to drive.
@@ -238,6 +205,7 @@ class Driver:
     def __init__(
         self,
         env: Environment,
+        task: Task,
         out: Output,
         commands: Commands,
         settings: DriveSettings,
@@ -245,6 +213,7 @@ class Driver:
         stamp_ns: int | None = None,
     ) -> None:
         self._env = env
+        self._task = task
         self._out = out
         self._messages = RobotMessages(env)
         self._commands = commands
@@ -272,14 +241,22 @@ class Driver:
             SimError: if the simulation diverges before the episode has started.
         """
         began_s = time.monotonic()
-        run = Run(self._env, start, self._settings.limits(plan.defect))
+        limits = self._settings.limits(is_defective=plan.defect != "none")
+        run = Run(self._env, self._task, start, limits)
         reset_s = time.monotonic() - began_s
-        controller = plan.controller() if self._settings.mode == "expert" else None
+        controller = plan.controller(self._task) if self._settings.mode == "expert" else None
         self.reset_wanted = False
         self._commands.clear()
         self._stamp_ns += self._env.control_period_ns
         episode = DrivenEpisode(
-            episode_id or new_episode_id(), name, plan, self._stamp_ns, run, controller, reset_s
+            id=episode_id or new_episode_id(),
+            name=name,
+            task=self._task,
+            plan=plan,
+            start_ns=self._stamp_ns,
+            run=run,
+            controller=controller,
+            reset_s=reset_s,
         )
         pilot: Pilot = partial(self._answer_by_messages, episode)
         if controller is not None:

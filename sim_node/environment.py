@@ -84,6 +84,10 @@ class Environment(Protocol):
     def object_names(self) -> Sequence[str]:
         """Movable objects: the keys of `Observation.objects`, in this order."""
 
+    @property
+    def n_steps(self) -> int:
+        """Commands executed since the last reset."""
+
     def reset(self, start_state: ArrayLike) -> Observation:
         """Restore a start state and let it settle.
 

@@ -11,46 +11,12 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import TypeVar
 
-from curation_ros.core.episode.phases import PHASES
-from curation_ros.core.errors import ConfigError
 from sim_node.environment import Command, Environment
-from sim_node.phases import PhaseTracker
+from sim_node.settings import EpisodeLimits
 from sim_node.starts import Start
-from sim_node.tasks.task import Controller, Step
-
-MAX_STEPS = 500
-"""Most commands of an episode, unless somebody asks for another number."""
-
-STEPS_AFTER_SUCCESS = 20
-"""Commands after success: a demonstration goes on for 1 s, to show what success looks like."""
+from sim_node.tasks.task import Controller, Step, Task
 
 Returned = TypeVar("Returned")
-
-
-@dataclass(frozen=True)
-class EpisodeLimits:
-    """When an episode ends.
-
-    Attributes:
-        max_steps: most commands, at least 1.
-        steps_after_success: commands after the one that succeeded; 0 for rollouts of policies.
-    """
-
-    max_steps: int = MAX_STEPS
-    steps_after_success: int = STEPS_AFTER_SUCCESS
-
-    def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            ConfigError: if one is out of range.
-        """
-        if self.max_steps < 1 or self.steps_after_success < 0:
-            raise ConfigError(
-                f"max_steps must be >= 1 and steps_after_success >= 0, "
-                f"got {self.max_steps} and {self.steps_after_success}"
-            )
-
 
 Pilot = Callable[[Step], Generator[bool, None, Command | None]]
 """Answers a step with a command; None ends the episode. It yields while it waits, and it yields
@@ -87,6 +53,7 @@ class Run:
 
     Args:
         env: reset by this constructor, and stepped by `play`.
+        task: what is to be done.
         start: where to start.
         limits: when to end.
 
@@ -101,17 +68,18 @@ class Run:
         SimError: if the start state is invalid or the simulation diverges while it settles.
     """
 
-    def __init__(self, env: Environment, start: Start, limits: EpisodeLimits) -> None:
+    def __init__(self, env: Environment, task: Task, start: Start, limits: EpisodeLimits) -> None:
         self._env = env
+        self._phases = task.phases
         self._limits = limits
         self._first = env.reset(start.state)
-        self._tracker = PhaseTracker.from_observation(self._first)
+        self._tracker = task.tracker(self._first)
         self.start = start
         self.n_steps = 0
         self.success_step: int | None = None
         self.is_success_now = False
         self.stage = ""
-        self.phase_steps = [0] * len(PHASES)
+        self.phase_steps = [0] * len(task.phases)
 
     def play(self, pilot: Pilot) -> Generator[bool, None, None]:
         """Run the loop; call once.
@@ -126,7 +94,7 @@ class Run:
         observation = self._first
         while self.n_steps < limits.max_steps:
             phase_index = tracker.update(observation)
-            self.stage = tracker.name
+            self.stage = self._phases[phase_index]
             step = Step(self.n_steps, observation, phase_index, self.stage, tracker.progress)
             command = yield from pilot(step)
             if command is None:
@@ -159,6 +127,7 @@ class Run:
 
 def run_episode(
     env: Environment,
+    task: Task,
     start: Start,
     controller: Controller,
     limits: EpisodeLimits | None = None,
@@ -170,6 +139,7 @@ def run_episode(
 
     Args:
         env: reset by this function.
+        task: what is to be done.
         start: where to start.
         controller: one that has not acted yet.
         limits: when to end; default: those of a demonstration.
@@ -180,7 +150,7 @@ def run_episode(
     Raises:
         SimError: if the simulation diverged.
     """
-    run = Run(env, start, limits or EpisodeLimits())
+    run = Run(env, task, start, limits or EpisodeLimits())
     given_up = ""
 
     def pilot(step: Step) -> Generator[bool, None, Command | None]:

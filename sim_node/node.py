@@ -36,16 +36,21 @@ from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import EVENTS, LATCHED, MAPPED
 from curation_ros.nodes.spinning import Finished, WorkingNode, run
 from sim_node.defects import DEFECTS
-from sim_node.driving import Commands, DrivenEpisode, Driver, DriveSettings
-from sim_node.env import LiberoEnv
-from sim_node.episodes import MAX_STEPS, STEPS_AFTER_SUCCESS
+from sim_node.driving import Commands, DrivenEpisode, Driver
 from sim_node.messages import CLOCK_TOPIC, COMMAND_TOPICS, COMMAND_TYPES, RobotMessages
 from sim_node.planning import EpisodePlan, plan_episodes
-from sim_node.starts import parse_starts
+from sim_node.settings import (
+    MAX_STEPS,
+    SIMULATED_TASK,
+    STEPS_AFTER_SUCCESS,
+    DriveSettings,
+)
+from sim_node.tasks import TASKS, start_names
 
 PARAMETERS = (
     Parameter("mode", "expert", "who drives", choices=("expert", "command")),
     Parameter("sync", "lockstep", "when to step", choices=("lockstep", "free")),
+    Parameter("simulated_task", SIMULATED_TASK, "what is simulated", choices=tuple(TASKS)),
     Parameter("episodes", 1, "how many; 0: on and on, owned by somebody else", 0, 100_000),
     Parameter("task", "bowl", "short names are <task>-<number>"),
     Parameter("first_number", 1, "number of the first episode", 0, 1_000_000),
@@ -145,9 +150,9 @@ class SimNode(WorkingNode):
         self._p = p = declare(self, PARAMETERS)
         n = max(1, p["episodes"])
         began_s = time.perf_counter()
-        starts = parse_starts(p["starts"] or f"generated:{p['seed']}:{n}")
-        self._starts = {start.name: start for start in starts}
-        names = list(self._starts)
+        task = TASKS[p["simulated_task"]]
+        names = start_names(p["starts"] or f"generated:{p['seed']}:{n}", task.name)
+        self._starts = {name: task.start(name) for name in names}
         self._expert = p["mode"] == "expert"
         if self._expert:
             self._plans = plan_episodes(
@@ -158,15 +163,17 @@ class SimNode(WorkingNode):
             self._plans = [EpisodePlan(i, names[i % k], i // k, "none", 0, 0) for i in range(n)]
         dataset = Path(p["dataset"]).expanduser()
         self._dataset = Dataset(dataset, create=True) if p["dataset"] else None
-        self._env = LiberoEnv(lean=p["lean"])
+        self._env = task.environment(lean=p["lean"])
         ready_s = time.perf_counter() - began_s
-        self.get_logger().info(f"LIBERO and {len(starts)} starts ready in {ready_s:.1f} s")
+        self.get_logger().info(
+            f"{task.benchmark_id} and {len(names)} starts ready in {ready_s:.1f} s"
+        )
         self._out = _Publishers(
             self, RobotMessages(self._env).types, owner=p["episodes"] > 0, expert=self._expert
         )
         self._commands = Commands()
         settings = DriveSettings(**{field.name: p[field.name] for field in fields(DriveSettings)})
-        self._driver = Driver(self._env, self._out, self._commands, settings, peers=self)
+        self._driver = Driver(self._env, task, self._out, self._commands, settings, peers=self)
         self._is_recorded = p["episodes"] > 0 and "recorder" in p["wait_for"]
         self._recorder: dict[str, Status] = {}
         self._outcomes: list[str] = []

@@ -9,7 +9,7 @@ import numpy as np
 
 from curation_ros.core.errors import ConfigError
 from sim_node.defects import DEFECTS, DefectiveController
-from sim_node.expert import Expert
+from sim_node.tasks.task import Task
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class EpisodePlan:
     expert_seed: int
     seed: int
 
-    def controller(self) -> DefectiveController:
+    def controller(self, task: Task) -> DefectiveController:
         """The expert of this episode, with its defect."""
-        return DEFECTS[self.defect].inject(Expert(self.expert_seed), self.seed)
+        return DEFECTS[self.defect].inject(task.expert(self.expert_seed), task, self.seed)
 
 
 def plan_episodes(

@@ -76,30 +76,30 @@ CHOSEN = (
     Import("curation_ros.nodes.messages", "curation_ros.nodes.health"),
     # Nodes meet over topics.
     Import("curation_ros.nodes.recorder", "curation_ros.nodes.curator"),
-    Import("curation_ros.nodes.curator", "sim_node.env"),
+    Import("curation_ros.nodes.curator", "sim_node.libero.env"),
     Import("curation_ros.nodes.replay", "policy_node.policy"),
     Import("sim_node.node", "policy_node.policy"),
-    Import("sim_node.env", "policy_node.policy"),
-    Import("policy_node.node", "sim_node.env"),
-    Import("policy_node.controller", "sim_node.env"),
+    Import("sim_node.libero.env", "policy_node.policy"),
+    Import("policy_node.node", "sim_node.libero.env"),
+    Import("policy_node.controller", "sim_node.libero.env"),
     # The simulator, policies and training are plain Python.
-    Import("sim_node.env", "curation_ros.nodes.messages"),
-    Import("sim_node.env", "curation_ros.bags.reader"),
+    Import("sim_node.libero.env", "curation_ros.nodes.messages"),
+    Import("sim_node.libero.env", "curation_ros.bags.reader"),
     Import("sim_node.starts", "curation_ros.dataset.dataset"),
-    Import("sim_node.env", "sim_node.node"),
+    Import("sim_node.libero.env", "sim_node.node"),
     Import("policy_node.policy", "policy_node.train"),
     Import("policy_node.train", "curation_ros.bags.reader"),
     Import("policy_node.policy", "curation_ros.nodes.qos"),
     # Scoring needs no simulator, policy or ROS.
     Import("curation_ros.bags.reader", "sim_node.starts"),
     Import("curation_ros.batch.audit", "policy_node.policy"),
-    Import("curation_ros.live.recorder", "sim_node.env"),
+    Import("curation_ros.live.recorder", "sim_node.libero.env"),
     Import("curation_ros.cli.score", "curation_ros.nodes.watcher"),
     Import("curation_ros.cli.select", "sim_node.starts"),
     Import("curation_ros.study.plan", "sim_node.starts"),
     # Packages that lie in several layers stay empty, and the front door is for others.
     Import("curation_ros.core", "curation_ros.cli.main"),
-    Import("sim_node", "sim_node.env"),
+    Import("sim_node", "sim_node.libero.env"),
     Import("curation_ros.nodes", "curation_ros.core.errors"),
     Import("curation_ros.core.errors", "curation_ros"),
     Import("curation_ros.cli.score", "curation_ros"),
@@ -117,7 +117,7 @@ CHOSEN = (
     Import("curation_ros.study.units", "torch"),
     Import("policy_node.policy", "torch"),
     Import("policy_node.observation", "rclpy"),
-    Import("sim_node.env", "rclpy"),
+    Import("sim_node.libero.env", "rclpy"),
 )
 
 

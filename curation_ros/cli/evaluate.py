@@ -73,7 +73,7 @@ def _rollouts(args: argparse.Namespace, policy_id: str) -> Iterator[dict[str, An
             shutil.rmtree(logs, ignore_errors=True)
         return
     from curation_ros.study.unit_work import roll_policy
-    from sim_node.starts import start_names
+    from sim_node.tasks import start_names
 
     tasks = [(args.policy, name, args.max_steps) for name in start_names(args.starts)]
     for done in spread(roll_policy, tasks, jobs=args.jobs, backend=args.backend):

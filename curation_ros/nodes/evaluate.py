@@ -111,7 +111,7 @@ def count_starts(spec: str) -> int:
     Raises:
         CurationError: if it is no specification.
     """
-    from sim_node.starts import start_names
+    from sim_node.tasks import start_names
 
     return len(start_names(spec))
 

@@ -61,7 +61,7 @@ def check_starts(plan: StudyPlan) -> None:
     Raises:
         ConfigError: naming a start state that is shared.
     """
-    from sim_node.starts import start_names
+    from sim_node.tasks import start_names
 
     used: dict[str, str] = {}
     for name, settings in plan.collections.items():
@@ -86,6 +86,6 @@ def _collection(settings: Mapping[str, Any], name: str) -> Collection:
     from curation_ros.study.collect import Collection
 
     try:
-        return Collection(**settings)
-    except TypeError as err:
+        return Collection.from_settings(settings)
+    except ConfigError as err:
         raise ConfigError(f"dataset {name!r}: {err}") from err

@@ -139,7 +139,7 @@ def _keep_counts(study: Study) -> list[int]:
 
 
 def _stage(study: Study, stage: Stage, rollouts: Mapping[tuple[str, str], Row]) -> Row:
-    from sim_node.starts import start_names
+    from sim_node.tasks import start_names
 
     starts = start_names(stage.starts)
     cells = [cell for cell in study.cells if cell.stage is stage]

@@ -235,7 +235,7 @@ def _train(
 def _roll(
     trials: PolicyTrials, cells: list[Cell], label: str, clock: _Clock, log: Log, ticks: Ticks
 ) -> list[str]:
-    from sim_node.starts import start_names
+    from sim_node.tasks import start_names
 
     units = [
         RolloutUnit(policy, start)

@@ -19,7 +19,7 @@ from curation_ros.files import append_line, named_errors, read_lines, try_lock
 from curation_ros.study.plan import StudyPlan
 from curation_ros.study.unit_work import roll_units, train_units
 from curation_ros.study.units import PolicyUnit, Progress, RolloutUnit, Row, Unit, start_name
-from sim_node.episodes import MAX_STEPS
+from sim_node.settings import MAX_STEPS
 
 #: Runs that try a unit before it stays failed.
 ATTEMPTS = 2

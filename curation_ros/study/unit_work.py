@@ -14,9 +14,8 @@ from policy_node.mlp import MlpPolicy
 from policy_node.policy import load_policy
 from policy_node.rollouts import Rollout, rollout
 from policy_node.settings import TrainingSettings
-from sim_node.env import process_env
-from sim_node.episodes import MAX_STEPS
-from sim_node.starts import start_by_name
+from sim_node.settings import MAX_STEPS, SIMULATED_TASK
+from sim_node.tasks import process_environment, task_named
 
 
 def policy_folder(study: Path, policy_id: str) -> Path:
@@ -36,7 +35,9 @@ def roll_policy(policy: Path, start: str, max_steps: int | None) -> Rollout:
         ConfigError, PolicyError, SimError: as `policy_node.rollouts.rollout` does.
     """
     limit = MAX_STEPS if max_steps is None else max_steps
-    return rollout(process_env(), start_by_name(start), load_policy(policy), limit)
+    task = task_named(SIMULATED_TASK)
+    env = process_environment(task.name)
+    return rollout(env, task, task.start(start), load_policy(policy), limit)
 
 
 def roll_units(
@@ -58,11 +59,13 @@ def roll_units(
         steps = 0
         try:
             policy = load_policy(policy_folder(study, unit.policy))
-            start = start_by_name(start_name(unit.start))
+            task = task_named(SIMULATED_TASK)
+            start = task.start(start_name(unit.start))
+            env = process_environment(task.name)
             try:
-                made = rollout(process_env(), start, policy, max_steps, gives_up=gives_up)
+                made = rollout(env, task, start, policy, max_steps, gives_up=gives_up)
             except CurationError:
-                steps = max(0, process_env().n_steps)
+                steps = env.n_steps
                 raise
         except CurationError as err:
             ended = {"success": False, "steps": steps, "stage": "", "ended": ""}

@@ -15,7 +15,7 @@ from curation_ros.core.errors import ConfigError
 from curation_ros.core.types import Span
 from policy_node.settings import DEFAULTS
 from policy_node.variants import Variant, read_training_config
-from sim_node.starts import start_names
+from sim_node.tasks import start_names
 
 Row = dict[str, Any]
 #: Called with each row when it is logged.

@@ -23,7 +23,7 @@ from curation_ros.study.running import Cell, Study
 from curation_ros.study.terms import DECIDED
 from curation_ros.study.training_sets import training_set
 from curation_ros.study.trials import PolicyTrials
-from sim_node.starts import start_names
+from sim_node.tasks import start_names
 
 N_POINTS = 6 * POINTS_PER_PHASE
 #: How well each made-up scorer tells good from bad: shift of the good ones' scores.

@@ -37,9 +37,10 @@ from policy_node.policy import load_policy  # noqa: E402 - needs safetensors
 from policy_node.rollouts import SimController, field_values  # noqa: E402 - needs LIBERO
 from policy_node.settings import TrainingSettings  # noqa: E402 - as its neighbours
 from policy_node.train import train  # noqa: E402 - needs torch
-from sim_node.env import LiberoEnv  # noqa: E402 - needs LIBERO
-from sim_node.episodes import EpisodeLimits, run_episode  # noqa: E402 - needs LIBERO
-from sim_node.starts import parse_starts  # noqa: E402 - needs LIBERO
+from sim_node.episodes import run_episode  # noqa: E402 - needs LIBERO
+from sim_node.settings import EpisodeLimits  # noqa: E402 - needs LIBERO
+from sim_node.tasks import start_names  # noqa: E402 - needs LIBERO
+from sim_node.tasks.bowl_on_plate import TASK  # noqa: E402 - needs LIBERO
 
 START = "generated:5:1"
 MAX_STEPS = 400
@@ -104,10 +105,12 @@ def driven(graph, folder):
 def in_process(folder):
     """Steps and commands of the same policy from the same start, and how it went."""
     steps = []
-    with LiberoEnv() as env:
+    [start] = start_names(START)
+    with TASK.environment() as env:
         result = run_episode(
             env,
-            parse_starts(START)[0],
+            TASK,
+            TASK.start(start),
             SimController(load_policy(folder)),
             EpisodeLimits(MAX_STEPS, steps_after_success=0),
             on_step=lambda step, command: steps.append((step, command)),

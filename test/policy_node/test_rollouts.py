@@ -8,28 +8,25 @@ from demonstrations import TOPIC_MAP
 from mlps import mlp
 from toy_policies import ChunkedPolicy
 
-from curation_ros.core.episode.phases import PHASES
-
 pytestmark = pytest.mark.sim
 pytest.importorskip("mujoco")
 pytest.importorskip("libero")
+
+from sim_node.settings import EpisodeLimits  # noqa: E402 - needs LIBERO
+from sim_node.tasks.bowl_on_plate import TASK  # noqa: E402 - needs LIBERO
 
 MAX_STEPS = 12
 
 
 @pytest.fixture(scope="module")
 def env():
-    from sim_node.env import LiberoEnv
-
-    with LiberoEnv() as simulator:
+    with TASK.environment() as simulator:
         yield simulator
 
 
 @pytest.fixture(scope="module")
 def start():
-    from sim_node.starts import generated_start
-
-    return generated_start(0, 0)
+    return TASK.start("generated-0-000")
 
 
 def test_observations_become_fields_of_the_topic_map(env, start):
@@ -43,14 +40,12 @@ def test_observations_become_fields_of_the_topic_map(env, start):
 
 
 def test_rollout_is_bounded_and_repeats_exactly(env, start):
-    from policy_node.rollouts import evaluate, rollout
+    from policy_node.rollouts import rollout
 
     made = mlp()
-    first = rollout(env, start, made, MAX_STEPS)
+    first = rollout(env, TASK, start, made, MAX_STEPS)
     state = env.data.qpos.copy()
-    reported = []
-    again = evaluate(made, [start, start], env, MAX_STEPS, progress=reported.append)
-    assert again == reported == [first, first]
+    assert rollout(env, TASK, start, made, MAX_STEPS) == first
     np.testing.assert_array_equal(env.data.qpos, state)
     assert json.loads(json.dumps(first.to_json())) == {
         "policy": made.card.id,
@@ -59,14 +54,14 @@ def test_rollout_is_bounded_and_repeats_exactly(env, start):
         "steps": MAX_STEPS,
         "stage": first.stage,
     }
-    assert first.stage in PHASES
+    assert first.stage in TASK.phases
 
 
 def test_success_ends_the_rollout(env, start, monkeypatch):
     from policy_node.rollouts import rollout
 
     monkeypatch.setattr(env, "is_success", lambda: True)
-    done = rollout(env, start, mlp(), MAX_STEPS)
+    done = rollout(env, TASK, start, mlp(), MAX_STEPS)
     assert (done.success, done.steps) == (True, 1)
 
 
@@ -74,16 +69,14 @@ def test_success_ends_the_rollout(env, start, monkeypatch):
 def test_a_dropped_bowl_is_given_up_and_a_carried_one_is_not(env, start, defect, why):
     from policy_node.rollouts import GiveUp
     from sim_node.defects import DEFECTS
-    from sim_node.episodes import EpisodeLimits, run_episode
-    from sim_node.expert import Expert
+    from sim_node.episodes import run_episode
 
     def run(give_up):
-        controller = DEFECTS[defect].inject(Expert(0), 0)
-        return run_episode(
-            env, start, controller, EpisodeLimits(steps_after_success=0), give_up=give_up
-        )
+        controller = DEFECTS[defect].inject(TASK.expert(0), TASK, 0)
+        limits = EpisodeLimits(steps_after_success=0)
+        return run_episode(env, TASK, start, controller, limits, give_up=give_up)
 
-    ended, whole = run(GiveUp()), run(None)
+    ended, whole = run(GiveUp(TASK)), run(None)
     assert ended.given_up == why
     assert ended.is_success == whole.is_success == (defect == "none")
     assert (ended.n_steps == whole.n_steps) == (defect == "none")
@@ -97,21 +90,26 @@ def test_a_policy_that_goes_nowhere_is_given_up(env, start):
         def act(self):
             return {"twist": np.zeros(3), "gripper": np.array([-1.0])}
 
-    ended = rollout(env, start, Idle(), gives_up=True)
+    ended = rollout(env, TASK, start, Idle(), gives_up=True)
     assert (ended.success, ended.ended, ended.steps) == (False, "phase", GiveUp.PHASE_STEPS)
-    assert ended.stage == PHASES[0]
+    assert ended.stage == TASK.phases[0]
 
 
 @pytest.mark.parametrize("ensembles", [False, True])
 def test_chunked_policy_is_rolled_out_like_any_other(env, start, ensembles):
     """Its commands are those that it gives when it is shown the same observations alone."""
     from policy_node.rollouts import SimController, field_values
-    from sim_node.episodes import EpisodeLimits, run_episode
+    from sim_node.episodes import run_episode
 
     steps = []
     controller = SimController(ChunkedPolicy(horizon=5, ensembles=ensembles))
     run_episode(
-        env, start, controller, EpisodeLimits(MAX_STEPS), on_step=lambda *s: steps.append(s)
+        env,
+        TASK,
+        start,
+        controller,
+        EpisodeLimits(MAX_STEPS),
+        on_step=lambda *s: steps.append(s),
     )
     alone = ChunkedPolicy(horizon=5, ensembles=ensembles)
     for step, executed in steps:
@@ -132,6 +130,6 @@ def test_policy_without_gripper_leaves_it_as_it_is(env, start):
         def act(self):
             return {"twist": super().act()["twist"]}
 
-    step = Step(0, env.reset(start.state), 0, PHASES[0], 0.0)
+    step = Step(0, env.reset(start.state), 0, TASK.phases[0], 0.0)
     _, gripper = SimController(Handless()).act(step)
     assert gripper == 0.0

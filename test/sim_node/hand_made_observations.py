@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from curation_ros.core.episode.phases import PHASES
-from sim_node.env import BOWL, PLATE
 from sim_node.environment import Observation
+from sim_node.tasks.bowl_on_plate import BOWL, PLATE
+from sim_node.tasks.pick_and_place import PHASES
 from sim_node.tasks.task import Step
 
 BOWL_START_M = np.array([-0.05, 0.20, 0.90])
@@ -28,7 +28,9 @@ def observation_at(eef_position_m, width_m: float = 0.08, bowl_m=BOWL_START_M) -
     )
 
 
-def step_at(eef_position_m, phase_index: int = 0, **observed) -> Step:
-    """A step of which only observation and phase matter."""
+def step_at(
+    eef_position_m, phase_index: int = 0, progress: float = 0.0, *, index: int = 0, **observed
+) -> Step:
+    """A step with a hand-made observation."""
     observation = observation_at(eef_position_m, **observed)
-    return Step(0, observation, phase_index, PHASES[phase_index], 0.0)
+    return Step(index, observation, phase_index, PHASES[phase_index], progress)

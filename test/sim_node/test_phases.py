@@ -4,16 +4,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco")
-
 from hand_made_observations import BOWL_START_M, PLATE_START_M, observation_at
 
-from sim_node import phases
-from sim_node.phases import PhaseTracker
+from sim_node.tasks.bowl_on_plate import GEOMETRY, TASK
+from sim_node.tasks.pick_and_place import GRASP, LIFT, RELEASE, PickAndPlaceTracker
 
-GRASP_M = phases.grasp_point(BOWL_START_M)
-PLACE_M = phases.place_point(PLATE_START_M)
+GRASP_M = GEOMETRY.grasp_point(BOWL_START_M)
+PLACE_M = GEOMETRY.place_point(PLATE_START_M)
 
 
 def ideal_path() -> list[tuple[np.ndarray, float]]:
@@ -39,7 +36,7 @@ def ideal_path() -> list[tuple[np.ndarray, float]]:
 
 
 def track(path, bowl_m=BOWL_START_M) -> list[tuple[int, float]]:
-    tracker = PhaseTracker(BOWL_START_M, PLATE_START_M)
+    tracker = PickAndPlaceTracker(GEOMETRY, BOWL_START_M, PLATE_START_M)
     rows = []
     for eef_m, width_m in path:
         index = tracker.update(observation_at(eef_m, width_m, bowl_m))
@@ -60,13 +57,13 @@ def test_progress_is_in_bounds_and_never_falls_within_a_phase():
     for (before, old), (after, new) in pairwise(rows):
         assert 0.0 <= new <= 1.0
         assert after > before or new >= old
-    assert rows[-1] == (phases.RELEASE, 1.0)
+    assert rows[-1] == (RELEASE, 1.0)
 
 
 def test_lift_progress_is_height():
     up = np.array([0.0, 0.0, 1.0])
-    tracker = PhaseTracker(BOWL_START_M, PLATE_START_M)
-    tracker.index = phases.LIFT
+    tracker = PickAndPlaceTracker(GEOMETRY, BOWL_START_M, PLATE_START_M)
+    tracker.index = LIFT
     tracker.update(observation_at(GRASP_M + 0.035 * up))
     tracker.update(observation_at(GRASP_M + 0.11 * up))
     assert tracker.progress == pytest.approx(0.5)
@@ -78,15 +75,17 @@ def test_tracker_never_reads_the_live_bowl():
 
 def test_grasp_lasts_and_needs_closing_fingers():
     up = np.array([0.0, 0.0, 1.0])
-    tracker = PhaseTracker(BOWL_START_M, PLATE_START_M)
-    tracker.index = phases.GRASP
+    tracker = PickAndPlaceTracker(GEOMETRY, BOWL_START_M, PLATE_START_M)
+    tracker.index = GRASP
     for _ in range(15):
-        assert tracker.update(observation_at(GRASP_M + 0.034 * up, 0.08)) == phases.GRASP
-    assert tracker.update(observation_at(GRASP_M + 0.034 * up, 0.08)) == phases.GRASP
-    assert tracker.update(observation_at(GRASP_M + 0.034 * up, 0.0)) == phases.LIFT
+        assert tracker.update(observation_at(GRASP_M + 0.034 * up, 0.08)) == GRASP
+    assert tracker.update(observation_at(GRASP_M + 0.034 * up, 0.08)) == GRASP
+    assert tracker.update(observation_at(GRASP_M + 0.034 * up, 0.0)) == LIFT
     assert tracker.steps_in_phase == 1
 
 
-def test_name_is_that_of_the_index():
-    tracker = PhaseTracker.from_observation(observation_at([0.0, 0.0, 1.0]))
-    assert tracker.name == "PREGRASP"
+def test_task_takes_the_objects_of_the_first_observation():
+    first = observation_at(GRASP_M + np.array([0.0, 0.0, 0.12]))
+    tracker = TASK.tracker(first)
+    tracker.update(first)
+    assert TASK.phases[tracker.update(first)] == "DESCEND"

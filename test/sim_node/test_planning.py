@@ -5,8 +5,6 @@ from itertools import pairwise
 
 import pytest
 
-pytest.importorskip("mujoco")
-
 from curation_ros.core.errors import ConfigError
 from sim_node.planning import plan_episodes
 

@@ -2,16 +2,12 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-import pytest
-
-pytest.importorskip("mujoco")
-
 from hand_made_observations import step_at
 
 from curation_ros.configuration import topic_map_or_default
-from sim_node.env import BOWL, PLATE
 from sim_node.environment import Command
 from sim_node.messages import CLOCK_TOPIC, COMMAND_TYPES, RobotMessages, command_messages
+from sim_node.tasks.bowl_on_plate import BOWL, PLATE
 
 ENV = SimpleNamespace(
     joint_names=[*(f"robot0_joint{k}" for k in range(1, 8)), "left", "right"],

@@ -144,11 +144,31 @@ def test_workers_collect_the_same(collected: Path, tmp_path: Path) -> None:
         {"starts": "nonsense"},
         {"max_steps": 0},
         {"steps_after_success": -1},
+        {"simulated_task": "dance"},
+        {"topic_map": "nowhere.yaml"},
     ],
 )
 def test_collection_that_makes_no_sense_is_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         list(collect(tmp_path / "data", replace(SHORT, **wrong)))
+
+
+def test_another_task_is_collected_by_its_name(tmp_path: Path) -> None:
+    other = replace(SHORT, episodes=1, contamination=0.0, simulated_task="bowl_from_center")
+    [one] = collect(tmp_path / "data", other)
+    assert (one.problem, one.truth["task"]) == ("", "libero_spatial/2")
+    [bag] = Dataset(tmp_path / "data").bags()
+    bowl_m = read_episode(bag).field("bowl_position")[0]
+    assert np.linalg.norm(bowl_m[:2] - (-0.075, 0.0)) < 0.06
+    with pytest.raises(ConfigError, match="bowl-0001 has task 'libero_spatial/2', the plan"):
+        list(collect(tmp_path / "data", replace(other, simulated_task="bowl_on_plate")))
+
+
+def test_study_names_the_prefix_as_the_sim_node_does() -> None:
+    made = Collection.from_settings({"episodes": 2, "task": "cup"})
+    assert list(made.plan()) == ["cup-0001", "cup-0002"]
+    with pytest.raises(ConfigError, match="colour"):
+        Collection.from_settings({"episodes": 2, "colour": "red"})
 
 
 # --- going on -----------------------------------------------------------------------------------
@@ -157,7 +177,7 @@ def test_collection_that_makes_no_sense_is_refused(tmp_path: Path, wrong: dict[s
 def test_what_is_there_is_not_collected_again(data: Path) -> None:
     before = sorted(p.name for p in Dataset(data).bags())
     assert all(one.is_known for one in collect(data, SHORT))
-    more = list(collect(data, replace(SHORT, task="more", episodes=1, contamination=0.0)))
+    more = list(collect(data, replace(SHORT, name_prefix="more", episodes=1, contamination=0.0)))
     assert [(one.name, one.is_known) for one in more] == [("more-0001", False)]
     assert sorted(p.name for p in Dataset(data).bags())[:4] == before
 

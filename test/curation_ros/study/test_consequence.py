@@ -19,8 +19,8 @@ pytestmark = pytest.mark.sim
 pytest.importorskip("libero", reason="LIBERO is not installed")
 
 from curation_ros.study.collect import Collection, collect  # noqa: E402 - needs LIBERO
-from sim_node import phases  # noqa: E402
-from sim_node.defects import DEFECTS, Defect, NoDefect  # noqa: E402
+from sim_node.defects import DEFECTS, Defect  # noqa: E402
+from sim_node.defects.none import NoDefect  # noqa: E402
 from sim_node.environment import GRIPPER_OPEN  # noqa: E402
 from sim_node.tasks.task import Step  # noqa: E402
 
@@ -35,7 +35,7 @@ class LateDrop(NoDefect):
 
     def act(self, step: Step) -> tuple[Any, float]:
         action, gripper = super().act(step)
-        self._n_steps += step.phase_index == phases.TRANSPORT
+        self._n_steps += step.phase_name == "TRANSPORT"
         return action, GRIPPER_OPEN if self._n_steps > 25 else gripper
 
 
@@ -44,7 +44,7 @@ class MissedGrasp(NoDefect):
 
     def act(self, step: Step) -> tuple[Any, float]:
         action, gripper = super().act(step)
-        if step.phase_index == phases.GRASP:
+        if step.phase_name == "GRASP":
             action = np.array([0.0, 0.0, 0.9])
         return action, gripper
 

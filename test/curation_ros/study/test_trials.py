@@ -211,18 +211,20 @@ def test_failed_rollout_is_named_and_the_rest_goes_on(
 def test_diverged_simulation_fails_its_rollout_and_its_steps_count(
     study: PolicyTrials, units: list[PolicyUnit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sim_node.env import process_env
+    from sim_node.settings import SIMULATED_TASK
+    from sim_node.tasks import process_environment
+
+    simulator = process_environment(SIMULATED_TASK)
 
     def thrown() -> None:
         """As a contact gone wrong would; the warning is MuJoCo's own."""
 
         def after_four(row: Any = None) -> None:
-            env = process_env()
-            if env.n_steps == 4:
-                env.data.qvel[:] = 1e30
+            if simulator.n_steps == 4:
+                simulator.data.qvel[:] = 1e30
 
-        real = process_env().observe
-        monkeypatch.setattr(process_env(), "observe", lambda: (after_four(), real())[1])
+        real = simulator.observe
+        monkeypatch.setattr(simulator, "observe", lambda: (after_four(), real())[1])
 
     thrown()
     work = study.roll(rollouts(units[:1], STARTS[:1]))

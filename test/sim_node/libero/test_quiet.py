@@ -18,11 +18,10 @@ class NoOpenCv:
             raise ImportError("libGL.so.1: cannot open shared object file")
 
 sys.meta_path.insert(0, NoOpenCv())
-from sim_node.env import LiberoEnv
-from sim_node.starts import official_start
+from sim_node.tasks.bowl_on_plate import TASK
 
-with LiberoEnv(lean=False) as env:
-    print(env.reset(official_start(0).state).eef_position_m.shape)
+with TASK.environment(lean=False) as env:
+    print(env.reset(TASK.start("official-00").state).eef_position_m.shape)
 """
 
 

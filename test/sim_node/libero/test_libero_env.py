@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-pytest.importorskip("mujoco")
-
-from curation_ros.core.errors import ConfigError, SimError
-from sim_node import quiet_libero
-from sim_node.env import BOWL, PLATE, LiberoEnv
+from curation_ros.core.errors import SimError
 from sim_node.environment import Observation
-from sim_node.episodes import STEPS_AFTER_SUCCESS, run_episode
-from sim_node.expert import Expert
-from sim_node.starts import generated_start, official_start
+from sim_node.episodes import run_episode
+from sim_node.settings import STEPS_AFTER_SUCCESS
+from sim_node.tasks.bowl_on_plate import BOWL, PLATE, TASK
 
 pytestmark = pytest.mark.sim
+pytest.importorskip("libero", reason="LIBERO is not installed")
+
+from sim_node.libero.env import LiberoEnv  # noqa: E402 - needs LIBERO
 
 # The two paths differ by rounding (Cholesky factors against inverses), amplified by contacts.
 STATE_TOLERANCE = 1e-11
@@ -29,7 +28,7 @@ EPISODE_TOLERANCE_STEPS = 2
 
 @pytest.fixture(scope="module")
 def stock():
-    env = LiberoEnv(lean=False)
+    env = TASK.environment(lean=False)
     yield env
     env.close()
 
@@ -57,7 +56,7 @@ def flatten(observation: Observation) -> np.ndarray:
 
 def test_lean_equals_stock_for_random_actions(env, stock):
     for seed in range(2):
-        state = generated_start(0, seed).state
+        state = TASK.start(f"generated-0-{seed:03d}").state
         commands = random_commands(seed, 40)
         lean_rows = rollout_states(env, state, commands)
         stock_rows = rollout_states(stock, state, commands)
@@ -66,13 +65,14 @@ def test_lean_equals_stock_for_random_actions(env, stock):
 
 
 def test_lean_equals_stock_for_an_expert_episode(env, stock):
-    start = official_start(7)
+    start = TASK.start("official-07")
     seen: dict[bool, list[np.ndarray]] = {True: [], False: []}
     results = [
         run_episode(
             e,
+            TASK,
             start,
-            Expert(5),
+            TASK.expert(5),
             on_step=lambda step, _, e=e: seen[e.lean].append(flatten(step.observation)),
         )
         for e in (env, stock)
@@ -96,28 +96,28 @@ def test_lean_model_steps_as_the_full_one(env, stock):
 
 
 def test_reset_is_reproducible_to_the_bit(env):
-    state = generated_start(0, 3).state
+    state = TASK.start("generated-0-003").state
     commands = random_commands(9, 30)
     first = rollout_states(env, state, commands)
     # What ran in between must leave no trace: controller, gripper, warm start.
-    rollout_states(env, official_start(2).state, random_commands(10, 25))
+    rollout_states(env, TASK.start("official-02").state, random_commands(10, 25))
     assert np.array_equal(first, rollout_states(env, state, commands))
-    other = LiberoEnv()
+    other = TASK.environment()
     assert np.array_equal(first, rollout_states(other, state, commands))
 
 
 def test_stock_reset_is_reproducible_to_the_bit(stock):
-    state = official_start(4).state
+    state = TASK.start("official-04").state
     commands = random_commands(11, 6)
     first = rollout_states(stock, state, commands)
-    rollout_states(stock, official_start(2).state, random_commands(12, 5))
+    rollout_states(stock, TASK.start("official-02").state, random_commands(12, 5))
     assert np.array_equal(first, rollout_states(stock, state, commands))
 
 
 def test_observation_belongs_to_one_instant(env):
     import mujoco
 
-    env.reset(official_start(0).state)
+    env.reset(TASK.start("official-00").state)
     observation = env.step([0.5, -0.5, -0.5], -1)
     fresh = mujoco.MjData(env.model)
     fresh.qpos[:] = env.data.qpos
@@ -127,7 +127,7 @@ def test_observation_belongs_to_one_instant(env):
 
 
 def test_observation_is_what_the_simulator_holds(env):
-    env.reset(official_start(0).state)
+    env.reset(TASK.start("official-00").state)
     observation = env.step([0.5, -0.5, -0.5], 1)
     data = env.data
     for name in env.object_names:
@@ -148,7 +148,7 @@ def test_observation_is_what_the_simulator_holds(env):
 
 
 def test_observation_has_every_movable_object(env):
-    observation = env.reset(official_start(0).state)
+    observation = env.reset(TASK.start("official-00").state)
     assert set(observation.objects) == set(env.object_names)
     assert {BOWL, PLATE} <= set(env.object_names)
     assert len(env.object_names) == 5
@@ -159,14 +159,14 @@ def test_observation_has_every_movable_object(env):
 
 
 def test_observation_is_a_copy(env):
-    observation = env.reset(official_start(0).state)
+    observation = env.reset(TASK.start("official-00").state)
     before = flatten(observation).copy()
     env.step([1.0, 0.0, 0.0], 1)
     assert np.array_equal(before, flatten(observation))
 
 
 def test_gripper_zero_holds_the_last_command(env):
-    env.reset(official_start(0).state)
+    env.reset(TASK.start("official-00").state)
     for _ in range(12):
         env.step([0.0, 0.0, 0.0], 1)
     for _ in range(12):
@@ -175,54 +175,52 @@ def test_gripper_zero_holds_the_last_command(env):
 
 
 def test_diverged_simulation_is_an_error_and_a_reset_recovers(env):
-    state = official_start(0).state
+    state = TASK.start("official-00").state
     state[1 + env.model.nq + 9] = 1e12
     with pytest.raises(SimError, match="diverged in settling step 1: bad velocity"):
         env.reset(state)
-    observation = env.reset(official_start(0).state)
+    observation = env.reset(TASK.start("official-00").state)
     assert np.isfinite(flatten(observation)).all()
 
 
 def test_bad_input_is_an_error(env):
     with pytest.raises(SimError, match="start state"):
         env.reset(np.zeros(5))
-    env.reset(official_start(0).state)
+    env.reset(TASK.start("official-00").state)
     with pytest.raises(SimError, match="action"):
         env.step([0.0, np.nan, 0.0], 1)
     with pytest.raises(SimError, match="action"):
         env.step([0.0, 0.0], 1)
-    with pytest.raises(ConfigError, match="control_rate_hz"):
-        LiberoEnv(control_rate_hz=30)
 
 
 def test_closed_environment_is_an_error():
-    with LiberoEnv() as env:
+    with TASK.environment() as env:
         assert env.control_period_ns == 50_000_000
     with pytest.raises(SimError, match="closed"):
-        env.reset(official_start(0).state)
+        env.reset(TASK.start("official-00").state)
 
 
 def test_damaged_cache_is_built_again(env, monkeypatch, tmp_path):
-    from sim_node import compiled_task
+    from sim_node.libero import compiled, quiet
 
-    key = compiled_task._cache_key()
-    monkeypatch.setattr(quiet_libero, "cache_directory", lambda: tmp_path)
+    key = compiled._cache_key(TASK._problem)
+    monkeypatch.setattr(quiet, "cache_directory", lambda: tmp_path)
     (tmp_path / f"task-{key}.npz").write_bytes(b"no zip file")
     built = []
     monkeypatch.setattr(
-        quiet_libero, "build_stock_environment", lambda seed: built.append(seed) or object()
+        quiet, "build_stock_environment", lambda _, seed: built.append(seed) or object()
     )
-    facts = compiled_task.TaskFacts("", [], [], [], [], "", [], [], 1, 1, 1, [], {})
-    monkeypatch.setattr(compiled_task, "compile_task", lambda stock: (env.model, facts))
-    assert compiled_task.load_task().facts == facts
-    assert built == [compiled_task.FIXTURE_SEED]
-    assert compiled_task.load_task().facts == facts  # now from the file
-    assert built == [compiled_task.FIXTURE_SEED]
+    facts = compiled.ProblemFacts([], [], [], [], "", [], [], 1, 1, 1, [], {})
+    monkeypatch.setattr(compiled, "compile_problem", lambda stock: (env.model, facts))
+    assert compiled.load_problem(TASK._problem).facts == facts
+    assert built == [compiled.FIXTURE_SEED]
+    assert compiled.load_problem(TASK._problem).facts == facts  # now from the file
+    assert built == [compiled.FIXTURE_SEED]
 
 
 def test_import_asks_nothing_and_leaves_the_home_alone(tmp_path):
     code = (
-        "from sim_node import quiet_libero; quiet_libero.import_libero();"
+        "from sim_node.libero import quiet; quiet.import_libero();"
         "import os, sys; print(os.environ['LIBERO_CONFIG_PATH'], 'MUJOCO_GL' in os.environ)"
     )
     home = tmp_path / "home"

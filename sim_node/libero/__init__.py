@@ -1,0 +1,1 @@
+"""LIBERO as an environment: quiet import, a lean control loop, start states."""
