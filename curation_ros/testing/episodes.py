@@ -18,13 +18,17 @@ from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.episode.topic_map import TopicMap
-from curation_ros.core.types import Floats
+from curation_ros.core.types import Floats, Mask
 
 START_NS = 1_781_000_000_000_000_000
 CLOSE_AT, GRASP_STEPS, LIFT_STEPS = 95, 15, 59
 #: A good episode of 240 steps opens three steps before its end.
 TASK_STEPS, TAIL_STEPS = 240, 3
 OPEN_WIDTH_M, HELD_WIDTH_M = 0.08, 0.008
+#: Velocity of the effector in each phase, as a share of the largest.
+_VELOCITIES = np.array(
+    [[0.1, 0.05, -0.08], [0, 0, -0.2], [0, 0, 0], [0, 0, 0.2], [0.05, 0.15, -0.05], [0, 0, 0]]
+)
 
 
 @cache
@@ -72,51 +76,27 @@ def make_episode(
     """
     rng = np.random.default_rng(0) if rng is None else rng
     chosen_id = episode_id or str(uuid.UUID(bytes=rng.bytes(16), version=4))
-    task_steps = task_steps or n_steps
-    release_at = task_steps - TAIL_STEPS
+    release_at = (task_steps or n_steps) - TAIL_STEPS
     if open_at == -1:
         open_at = release_at
-    step = np.arange(n_steps)
     grasp_at = CLOSE_AT if close_at is None else close_at
-    lift_at, transport_at = grasp_at + GRASP_STEPS, grasp_at + GRASP_STEPS + LIFT_STEPS
-    starts = [0, int(0.6 * grasp_at), grasp_at, lift_at, transport_at, release_at]
-    # A release before a phase begins leaves that phase out.
-    phase = np.searchsorted(np.minimum(starts, release_at), step, side="right") - 1.0
-
-    velocity = np.array(
-        [[0.1, 0.05, -0.08], [0, 0, -0.2], [0, 0, 0], [0, 0, 0.2], [0.05, 0.15, -0.05], [0, 0, 0]]
-    )[phase.astype(int)]
-    twist = velocity + noise * rng.standard_normal((n_steps, 3))
-    twist[:, 0] += tremor * np.sin(2 * np.pi * 8.0 * step / rate_hz)
+    phase = _phase(n_steps, grasp_at, release_at)
+    twist = _VELOCITIES[phase.astype(int)] + noise * rng.standard_normal((n_steps, 3))
+    twist[:, 0] += tremor * np.sin(2 * np.pi * 8.0 * np.arange(n_steps) / rate_hz)
     eef = np.array([0.0, 0.0, 1.2]) + np.cumsum(twist * 0.013, axis=0)
-
-    open_command = np.ones(n_steps, dtype=bool)
-    if close_at is not None:
-        open_command[close_at:] = False
-        if open_at is not None:
-            open_command[max(open_at, 0) :] = True
-    lagged = open_command[np.maximum(step - finger_lag, 0)]
+    is_open = _open_command(n_steps, close_at, open_at)
+    lagged = is_open[np.maximum(np.arange(n_steps) - finger_lag, 0)]
     width = np.where(lagged, OPEN_WIDTH_M, HELD_WIDTH_M)
-    command = np.where(open_command, opens, -opens).astype(np.float64)
-
-    bowl = np.tile(eef[min(lift_at, n_steps - 1)] if n_steps else np.zeros(3), (n_steps, 1))
-    held = np.flatnonzero(~open_command & (step >= lift_at))
-    bowl[held] = eef[held]
-    if len(held) and held[-1] < n_steps - 1:  # a released object falls back to where it was
-        fallen_m = 0.5 * 9.81 * ((step[held[-1] + 1 :] - held[-1]) / rate_hz) ** 2
-        table_m = bowl[held[-1] + 1 :, 2].copy()
-        bowl[held[-1] + 1 :] = eef[held[-1]]
-        bowl[held[-1] + 1 :, 2] = np.maximum(eef[held[-1], 2] - fallen_m, table_m)
     made = {
         "eef_position": eef,
         "eef_quat_xyzw": np.tile([1.0, 0.0, 0.0, 0.0], (n_steps, 1)),
         "joint_position": np.cumsum(0.01 * rng.standard_normal((n_steps, 7)), axis=0),
         "finger_position": np.column_stack([width / 2, -width / 2]),
-        "bowl_position": bowl,
+        "bowl_position": _bowl(eef, is_open, grasp_at + GRASP_STEPS, rate_hz),
         "plate_position": np.tile([0.05, 0.2, 0.9], (n_steps, 1)),
         "phase": phase[:, None],
         "twist": twist,
-        "gripper": command[:, None],
+        "gripper": np.where(is_open, opens, -opens).astype(np.float64)[:, None],
         **(fields or {}),
     }
     period_ns = round(1e9 / rate_hz)
@@ -131,6 +111,40 @@ def make_episode(
         topic_map=topic_map(),
         findings=tuple(findings),
     )
+
+
+def _phase(n_steps: int, grasp_at: int, release_at: int) -> Floats:
+    """(n_steps,) index of the phase."""
+    lift_at = grasp_at + GRASP_STEPS
+    starts = [0, int(0.6 * grasp_at), grasp_at, lift_at, lift_at + LIFT_STEPS, release_at]
+    # A release before a phase begins leaves that phase out.
+    begun = np.searchsorted(np.minimum(starts, release_at), np.arange(n_steps), side="right")
+    return (begun - 1).astype(np.float64)
+
+
+def _open_command(n_steps: int, close_at: int | None, open_at: int | None) -> Mask:
+    """(n_steps,) whether the gripper is commanded to open."""
+    is_open = np.ones(n_steps, dtype=bool)
+    if close_at is not None:
+        is_open[close_at:] = False
+        if open_at is not None:
+            is_open[max(open_at, 0) :] = True
+    return is_open
+
+
+def _bowl(eef: Floats, is_open: Mask, lift_at: int, rate_hz: float) -> Floats:
+    """(T, 3) positions of the bowl: it lies, moves with the effector, and falls when released."""
+    n_steps = len(eef)
+    bowl = np.tile(eef[min(lift_at, n_steps - 1)] if n_steps else np.zeros(3), (n_steps, 1))
+    held = np.flatnonzero(~is_open & (np.arange(n_steps) >= lift_at))
+    bowl[held] = eef[held]
+    if len(held) and held[-1] < n_steps - 1:
+        last = held[-1]
+        fallen_m = 0.5 * 9.81 * (np.arange(1, n_steps - last) / rate_hz) ** 2
+        table_m = bowl[last + 1 :, 2].copy()
+        bowl[last + 1 :] = eef[last]
+        bowl[last + 1 :, 2] = np.maximum(eef[last, 2] - fallen_m, table_m)
+    return bowl
 
 
 def make_reference(rng: np.random.Generator, n: int = 6) -> list[Episode]:

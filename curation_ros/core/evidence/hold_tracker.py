@@ -61,11 +61,6 @@ class Departure:
         self.away_m = 0.0
 
     @property
-    def slip_m(self) -> float:
-        """How much farther away it is held now than at the grasp."""
-        return self._held_m - self._grasp_m
-
-    @property
     def is_possible(self) -> bool:
         """Whether it may have begun to leave."""
         return self._sum_m > 0.0
@@ -91,7 +86,8 @@ class Departure:
         self._sum_m = max(0.0, self._sum_m + min(away_m - self._allowed_m, most_m))
         towards_m = min(max(away_m, -self._follow_m), self._follow_m)
         self._held_m += towards_m * min(1.0, after_s / _FOLLOW_S)
-        return self._sum_m > self._threshold_m or self.slip_m > _SLIP_M
+        slip_m = self._held_m - self._grasp_m
+        return self._sum_m > self._threshold_m or slip_m > _SLIP_M
 
 
 class HoldTracker:
@@ -113,7 +109,6 @@ class HoldTracker:
         self._is_over = bool(grasp.reason)
         self._departure = Departure(grasp.distance_m, grasp.noise_m)
         self._phase = ""
-        self._slip_m = 0.0
         self._departed: int | None = None
         self._noticed: int | None = None
         self._left_open = self._is_put_down = False
@@ -127,7 +122,6 @@ class HoldTracker:
         self._n_jumps = 0
         self._stale = ""
         self._moved_m = 0.0
-        self._top = (-float("inf"), 0.0)
 
     def take(self, poses: Poses, step: int) -> None:
         """Take one more step in which the object is to be carried."""
@@ -149,8 +143,6 @@ class HoldTracker:
         if not poses.has_place[name][step] or (place == self._place and not self._may_rest()):
             self._miss(now_s, hand)
             return
-        if hand[2] >= self._top[0]:
-            self._top = (hand[2], place[2])
         if self._is_over:
             return
         if self._has_jumped(now_s, hand, place):
@@ -192,7 +184,6 @@ class HoldTracker:
         is_certain = self._departure.add(distance_m, after_s)
         if not self._departure.is_possible:
             self._departed, self._held_hand = None, hand
-            self._slip_m = self._departure.slip_m
             self._held_places = [*self._held_places[-2:], place]
         elif self._departed is None:
             self._departed, self._left_open = step, self._opened_z is not None
@@ -255,7 +246,6 @@ class HoldTracker:
         """What is known by now."""
         is_lost = self.state in ("broken", "never")
         stop = self._last + 1 if self._departed is None or not is_lost else self._departed
-        rose_m = self._top[0] - self._grasp.hand[2]
         return Hold(
             object=self._grasp.object,
             first=self._first,
@@ -268,8 +258,6 @@ class HoldTracker:
             n_carried=stop - self._first if self.state in ("carried", "broken") else 0,
             gap_m=self._departure.away_m if is_lost else 0.0,
             opened=is_lost and self._left_open,
-            slip_m=self._slip_m,
-            rise_ratio=(self._top[1] - self._grasp.at[2]) / rose_m if rose_m > _MOVED_M else None,
         )
 
     def end(self) -> Hold | None:

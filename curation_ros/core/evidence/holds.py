@@ -45,10 +45,6 @@ class Hold:
         n_carried: steps before it left; all of them if it did not.
         gap_m: growth of the distance from the effector when the loss was noticed, in metres.
         opened: whether the gripper had been commanded to open when it left.
-        slip_m: growth of the distance from the effector between the grasp and the end, or the
-            step before it left, in metres.
-        rise_ratio: rise of the object divided by that of the effector at the effector's highest
-            point; None if the effector did not rise.
     """
 
     object: str
@@ -62,8 +58,6 @@ class Hold:
     n_carried: int = 0
     gap_m: float = 0.0
     opened: bool = False
-    slip_m: float = 0.0
-    rise_ratio: float | None = None
 
     @property
     def n_steps(self) -> int:

@@ -10,7 +10,6 @@ from episodes import with_fields
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import (
-    BELOW_M,
     LIFT_AT,
     N_STEPS,
     RELEASE_AT,
@@ -51,8 +50,6 @@ def test_carried_to_the_end() -> None:
     assert (hold.object, hold.state, hold.phase) == ("bowl_position", "carried", "TRANSPORT")
     assert (hold.first, hold.last, hold.n_carried) == (LIFT_AT, RELEASE_AT - 1, N_CARRY)
     assert (hold.departed, hold.noticed, hold.opened) == (None, None, False)
-    assert hold.slip_m == pytest.approx(0.0, abs=1e-9)
-    assert hold.rise_ratio == pytest.approx(1.0)
     assert carrying_of(scene()).coupling == 1.0
 
 
@@ -63,7 +60,6 @@ def test_object_that_tilts_by_more_than_a_drop_shows_at_first_is_carried() -> No
     assert change_m > 0.025  # a fixed offset with a limit of 2 cm would call it dropped
     hold = only_hold(tilted)
     assert hold.state == "carried"
-    assert hold.rise_ratio == pytest.approx((0.15 + BELOW_M * (1 - np.cos(0.6))) / 0.15)
 
 
 def test_drop_in_lift_is_noticed_in_the_third_step() -> None:
@@ -75,7 +71,6 @@ def test_drop_in_lift_is_noticed_in_the_third_step() -> None:
     assert hold.n_carried == 40
     fallen_m = 0.5 * 9.81 * 0.15**2
     assert hold.gap_m == pytest.approx(fallen_m + 3 * 0.003, abs=0.001)
-    assert hold.rise_ratio == pytest.approx(0.0)
 
 
 def test_drop_with_the_gripper_closed_is_a_drop() -> None:
@@ -91,7 +86,6 @@ def test_object_that_was_left_behind_was_never_carried() -> None:
     assert hold.phase == "LIFT"
     assert hold.noticed is not None
     assert hold.noticed < LIFT_AT + 15
-    assert hold.rise_ratio == pytest.approx(0.0)
 
 
 def test_object_that_slides_out_of_the_fingers_is_lost() -> None:
@@ -104,13 +98,12 @@ def test_object_that_slides_out_of_the_fingers_is_lost() -> None:
     assert hold.noticed < LIFT_AT + 45
 
 
-def test_object_that_settles_in_the_fingers_is_carried_and_its_slip_measured() -> None:
+def test_object_that_settles_in_the_fingers_is_carried() -> None:
     settling = scene()
     bowl = settling.fields["bowl_position"].copy()
     bowl[:, 2] -= 0.0001 * np.clip(np.arange(N_STEPS) - LIFT_AT - 10, 0, 60)
     hold = only_hold(with_fields(settling, bowl_position=bowl))
     assert hold.state == "carried"
-    assert hold.slip_m == pytest.approx(0.006, abs=0.002)
 
 
 def test_later_drop_is_a_larger_coupling() -> None:
@@ -295,7 +288,7 @@ def test_object_without_a_publisher() -> None:
     assert unknown(far) == (
         "no object is within 0.2 m of the effector at the grasp, and bowl_position has no pose"
     )
-    # The plate is near, and does not move: that says nothing of the bowl.
+    # The plate is near and does not move. That shows nothing about the bowl.
     near = made.fields["plate_position"] + TREMOR_M * (np.arange(N_STEPS) % 2)[:, None]
     assert unknown(with_fields(made, bowl_position=gone, plate_position=near)) == (
         "plate_position was not carried, and bowl_position has no pose"

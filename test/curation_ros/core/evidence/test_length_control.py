@@ -194,7 +194,7 @@ def test_episodes_that_differ_only_in_tempo_look_alike() -> None:
         np.testing.assert_allclose(done[0], done[1])
 
 
-def test_no_phase_in_the_map_is_an_error_that_says_so() -> None:
+def test_no_phase_in_the_map_is_an_error_with_that_reason() -> None:
     episode = make_episode()
     fields = {k: v for k, v in episode.topic_map.fields.items() if v.role != "phase"}
     bare = replace(episode, topic_map=replace(episode.topic_map, fields=fields))

@@ -1,4 +1,4 @@
-"""Scorers of what became of the object: values by hand, words, and when they abstain."""
+"""Scorers of the carried object: values by hand, explanations, and when they abstain."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SAMPLE = Path(__file__).resolve().parents[4] / "bags" / "sample"
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_good_demonstration_scores_one_and_says_nothing(name: str) -> None:
+def test_good_demonstration_scores_one_without_an_explanation(name: str) -> None:
     scorer = SCORERS[name]()
     for episode in (scene(), scene(tilt_rad=0.5), make_episode(), read_episode(SAMPLE)):
         assert scorer.look(episode) == Look(1.0)
@@ -68,9 +68,9 @@ def test_object_coupling_by_hand() -> None:
     )
     behind = scene(is_taken=False, tremor_m=1e-5)
     assert scorer.score(behind) == 0.0
-    words = scorer.look(behind).explanation
-    assert words is not None
-    assert words.startswith("bowl_position was not taken along: left behind at ")
+    explanation = scorer.look(behind).explanation
+    assert explanation is not None
+    assert explanation.startswith("bowl_position was not taken along: left behind at ")
 
 
 def test_grip_consistency_by_hand() -> None:
@@ -82,9 +82,9 @@ def test_grip_consistency_by_hand() -> None:
     )
     empty = np.where(episode.fields["finger_position"] == 0.0025, 0.0005, 0.04) * [1, -1]
     nothing = with_fields(scene(), finger_position=empty[:N_STEPS])
-    words = scorer.look(nothing).explanation
-    assert words is not None
-    assert words.startswith("the fingers held nothing at ")
+    explanation = scorer.look(nothing).explanation
+    assert explanation is not None
+    assert explanation.startswith("the fingers held nothing at ")
 
 
 def test_phase_events_by_hand() -> None:
@@ -185,5 +185,5 @@ def test_rule_fitted_on_carries_keeps_them_and_discards_drops(name: str) -> None
     assert decide_on(curation, make_episode(rng)).verdict == "keep"
     dropped = decide_on(curation, make_episode(rng, open_at=140))
     assert dropped.verdict == "discard"
-    assert "at 7." in dropped.reason  # where, in words
+    assert "at 7." in dropped.reason  # the time, in the reason
     assert "in LIFT" in dropped.reason or "of LIFT" in dropped.reason

@@ -111,9 +111,9 @@ def test_live_equals_bag(fitted: Scorer, rng: np.random.Generator) -> None:
                 Messages.joined([s.data for s in of_topic]),
             )
         )
-    seen = live.finish(made.end_ns, {})
-    assert fitted.look(seen) == fitted.look(bag.finish(made.end_ns, {}))
-    assert fitted.look(seen) == fitted.look(made)
+    lived = live.finish(made.end_ns, {})
+    assert fitted.look(lived) == fitted.look(bag.finish(made.end_ns, {}))
+    assert fitted.look(lived) == fitted.look(made)
 
 
 def degenerate(kind: str) -> Episode:

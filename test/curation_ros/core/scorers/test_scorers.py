@@ -240,7 +240,7 @@ def test_gripper_timing_abstains_where_it_cannot_know(rng: np.random.Generator) 
         GripperTiming().score(replace(make_episode(rng), topic_map=without))
 
 
-def test_gripper_timing_says_when_and_where(rng: np.random.Generator) -> None:
+def test_gripper_timing_explains_when_and_where(rng: np.random.Generator) -> None:
     early = make_episode(rng, open_at=140)
     scorer = GripperTiming()
     assert scorer.look(early).explanation == (
