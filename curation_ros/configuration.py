@@ -12,7 +12,7 @@ from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap, read_topic_map
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.yaml_file import read_yaml
-from curation_ros.dataset.episodes import find_bags, read_episode
+from curation_ros.dataset.episodes import find_episodes, read_episode
 
 _WHAT = "curation config"
 _SOURCE = Path(__file__).resolve().parents[1]
@@ -120,7 +120,7 @@ def read_reference(paths: Sequence[Path], topic_map: TopicMap | None) -> list[Ep
     Raises:
         CurationError: if one cannot be read, or there is none.
     """
-    episodes = [read_episode(bag, topic_map) for bag in find_bags(paths)]
+    episodes = [read_episode(bag, topic_map) for bag in find_episodes(paths)]
     if not episodes:
         raise ConfigError(f"reference {', '.join(map(str, paths))}: no episode in it")
     return episodes

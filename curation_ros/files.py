@@ -9,6 +9,7 @@ import errno
 import fcntl
 import json
 import os
+import re
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -16,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
+from curation_ros.core.episode.identity import is_uuid
 from curation_ros.core.errors import CurationError
 
 
@@ -33,6 +35,14 @@ def named_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as err:
         raise CurationError(f"{err.filename or path}: {err.strerror or err}") from err
+
+
+def natural_order(path: Path) -> tuple[tuple[int, str], ...]:
+    """Sort key of files and folders by name: part 10 follows part 9, and ids follow their time."""
+    if is_uuid(path.stem):
+        return ((-1, path.stem),)
+    pieces = re.findall(r"\d+|\D+", path.name)
+    return tuple((int(p), "") if p.isdigit() and p.isascii() else (-1, p) for p in pieces)
 
 
 # --- atomic writes ------------------------------------------------------------------------------

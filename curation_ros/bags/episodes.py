@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from curation_ros.bags.bag import Bag
-from curation_ros.bags.folders import UUID
 from curation_ros.core.episode.builder import EpisodeBuilder
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.episode.identity import foreign_episode_id
+from curation_ros.core.episode.identity import foreign_episode_id, is_uuid
 from curation_ros.core.episode.status import EpisodeEvent, EventKind, owner_findings
 from curation_ros.core.episode.stream import Sample, Stamps
 from curation_ros.core.episode.topic_map import TopicMap
@@ -96,7 +95,7 @@ def _event_of(bag: Bag, topic_map: TopicMap, clock: Stamps, claimed_id: str) -> 
     if event.end_ns is None:  # the recorder died before the end was announced
         kind: EventKind = "aborted" if event.event == "aborted" else "ended"
         event = replace(event, event=kind, end_ns=max([event.start_ns, *clock.tolist()]))
-    claimed_id = claimed_id or (bag.name if UUID.fullmatch(bag.name) else event.id)
+    claimed_id = claimed_id or (bag.name if is_uuid(bag.name) else event.id)
     if announced is not None and claimed_id != event.id:
         line = f"wrong-id: the folder {claimed_id} has the bag of episode {event.id}"
         event = replace(event, reason="\n".join(filter(None, [event.reason, line])))

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from curation_ros.core.errors import BagError
-
-UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+from curation_ros.files import natural_order
 
 
 def is_bag(folder: Path) -> bool:
@@ -88,11 +87,3 @@ def _is_split(folder: Path, files: Sequence[Path]) -> bool:
     """Whether files are the parts of one recording, as rosbag2 names them: <folder>_<number>."""
     stem = re.escape(folder.resolve().name)
     return all(re.fullmatch(rf"{stem}_\d+", file.stem) for file in files)
-
-
-def natural_order(path: Path) -> tuple[tuple[int, str], ...]:
-    """Sort key under which part 10 follows part 9, and episodes follow the time of their ids."""
-    if UUID.fullmatch(path.stem):
-        return ((-1, path.stem),)
-    pieces = re.findall(r"\d+|\D+", path.name)
-    return tuple((int(p), "") if p.isdigit() and p.isascii() else (-1, p) for p in pieces)

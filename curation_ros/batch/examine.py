@@ -7,7 +7,6 @@ hash of both. What rules and decisions make of it costs next to nothing.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import CurationError
-from curation_ros.dataset.episodes import read_episode
+from curation_ros.dataset.episodes import read_episode, stamp_of
 from curation_ros.dataset.index import Index
 from curation_ros.dataset.layout import home_of
 from curation_ros.version import __version__
@@ -136,7 +135,7 @@ class _Task:
         self, bags: Sequence[Path], fresh: bool
     ) -> tuple[list[Examined], dict[Path, str]]:
         """Results in the order of the bags, and stamps of their files before they were read."""
-        stamps = {bag: _stamp(bag) for bag in bags}
+        stamps = {bag: stamp_of(bag) for bag in bags}
         known: dict[Path, Examination] = {}
         if not fresh:
             for some in _by_folder(bags):
@@ -168,19 +167,6 @@ def _key(fitted: FittedScorers, topic_map: TopicMap | None) -> str:
     """Under which an examination is kept: another version of ours may see other things."""
     by = "" if topic_map is None else f"+{topic_map.hash}"
     return f"{__version__}+{fitted.scoring_hash}{by}"
-
-
-def _stamp(bag: Path) -> str:
-    """Sizes and times of a bag's files; empty where they cannot be told."""
-    try:
-        if bag.is_dir():
-            with os.scandir(bag) as entries:
-                found = sorted((e.name, e.stat()) for e in entries if e.is_file())
-        else:
-            found = [(bag.name, bag.stat())]
-    except OSError:
-        return ""
-    return ";".join(f"{name}:{s.st_size}:{s.st_mtime_ns}" for name, s in found)
 
 
 class EpisodesOf:

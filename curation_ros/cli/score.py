@@ -28,7 +28,7 @@ from curation_ros.core.episode.topic_map import read_topic_map
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset
-from curation_ros.dataset.episodes import find_bags
+from curation_ros.dataset.episodes import find_episodes
 from curation_ros.dataset.layout import home_of, is_dataset
 from curation_ros.live.curator import log_decision
 
@@ -209,7 +209,7 @@ def _find(paths: list[Path]) -> tuple[list[Path], list[tuple[Path, CurationError
     missing = []
     for path in paths:
         try:
-            for bag in find_bags([path]):
+            for bag in find_episodes([path]):
                 bags.setdefault(bag.resolve(), bag)
         except CurationError as err:
             missing.append((path, err))

@@ -1,57 +1,64 @@
-"""Reads episodes: of bags, of folders of bags, and of datasets."""
+"""Finds and reads episodes: of any source, in datasets and elsewhere."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from operator import attrgetter
 from pathlib import Path
 
-from curation_ros.bags import episode_of, is_bag, open_bag
-from curation_ros.bags.folders import natural_order
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap
-from curation_ros.core.errors import BagError, CurationError
+from curation_ros.core.errors import CurationError, EpisodeError
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.layout import EPISODES, hint_of_datasets, is_dataset
+from curation_ros.sources import episodes_at, source_of
 
 
-def find_bags(paths: Iterable[Path]) -> list[Path]:
-    """Find the bags that a person means.
+def find_episodes(paths: Iterable[Path]) -> list[Path]:
+    """Find the episodes at the paths that a person names.
 
     Args:
-        paths: .mcap files, bags, folders of bags or files, and datasets. Names that begin with a
-            dot are skipped.
+        paths: episodes, files or folders of episodes, and datasets. Names that begin with a dot
+            are skipped.
 
     Returns:
         Paths for `read_episode` in the order given, each once. Within a dataset they are in the
         order of the recording, within another folder in the order of their names.
 
     Raises:
-        BagError: for a path that does not exist or has no bag in it.
+        EpisodeError: for a path that does not exist or has no episode in it.
     """
     found: dict[Path, Path] = {}
     for path in paths:
-        bags = _bags_in(path)
-        if not bags:
-            problem = f"{path} has no bag in it" if path.exists() else f"{path}: no such path"
-            raise BagError(problem + hint_of_datasets(path), finding="missing-file")
-        for bag in bags:
-            found.setdefault(bag.resolve(), bag)
+        if is_dataset(path):  # names are ids, whose plain order is that of the recording
+            inside = episodes_at(path / EPISODES, order=attrgetter("name"))
+        else:
+            inside = episodes_at(path)
+        if not inside:
+            problem = f"{path} has no episode in it" if path.exists() else f"{path}: no such path"
+            raise EpisodeError(problem + hint_of_datasets(path), finding="missing-file")
+        for episode in inside:
+            found.setdefault(episode.resolve(), episode)
     return list(found.values())
 
 
 def read_episode(path: Path, topic_map: TopicMap | None = None) -> Episode:
-    """Read the episode at a path.
+    """Read the episode at a path, of any source.
 
     Args:
-        path: folder of a bag, or an .mcap file.
-        topic_map: which fields to build; None: the map that is stored in the bag.
+        path: of the episode, such as the folder of a bag.
+        topic_map: which fields to build; None: the map that comes with the recording.
 
     Raises:
-        BagError: if the bag cannot be read, does not fit the map, or has no map and none is given.
-        ConfigError: if a path of the map does not exist in its type.
-        EpisodeError: if the episode cannot be built.
+        CurationError: if the episode cannot be read, does not fit the map, or has no map and none
+            is given.
     """
-    return episode_of(open_bag(path), topic_map, claimed_id=claimed_id(path))
+    return source_of(path).read(path, topic_map, claimed_id=claimed_id(path))
+
+
+def stamp_of(path: Path) -> str:
+    """A text that changes when the recording of an episode changes; empty if there is none."""
+    return source_of(path).stamp(path)
 
 
 def read_episodes(
@@ -98,21 +105,3 @@ def claimed_id(path: Path) -> str:
     """The id that a dataset claims for a bag by the name of its folder; empty outside of one."""
     bag = path.resolve()
     return bag.name if bag.parent.name == EPISODES else ""
-
-
-def _bags_in(path: Path) -> list[Path]:
-    if path.is_file() or is_bag(path):
-        return [path]
-    try:
-        if is_dataset(path):  # names are ids, whose plain order is that of the recording
-            inside = sorted((path / EPISODES).iterdir())
-        else:
-            inside = sorted(path.iterdir(), key=natural_order) if path.is_dir() else []
-    except OSError as err:
-        raise BagError(f"{path}: {err.strerror}") from err
-    return [
-        entry
-        for entry in inside
-        if not entry.name.startswith(".")
-        and (entry.suffix == ".mcap" if entry.is_file() else is_bag(entry))
-    ]

@@ -21,7 +21,7 @@ from curation_ros.core.episode.status import (
 from curation_ros.core.episode.stream import Sample, playback_order
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.core.types import NS_PER_S
-from curation_ros.dataset.episodes import claimed_id, find_bags
+from curation_ros.dataset.episodes import claimed_id, find_episodes
 from curation_ros.nodes.discovery import Discovery
 from curation_ros.nodes.messages import array_to_ros, message_type, status_from_ros
 from curation_ros.nodes.parameters import Parameter, declare
@@ -51,7 +51,7 @@ class Replay(WorkingNode):
         self._rate, self._wait_s = p["rate"], p["wait_s"]
         if not p["bags"]:
             raise ConfigError("replay: parameter 'bags' is empty: name a dataset or bags")
-        self._bags = find_bags([Path(b).expanduser() for b in p["bags"]])
+        self._bags = find_episodes([Path(b).expanduser() for b in p["bags"]])
         self._episode = self.create_publisher(DiagnosticArray, "episode", LATCHED)
         self._outputs = {
             topic: self.create_publisher(message_type(kind, topic), topic, MAPPED)

@@ -27,6 +27,7 @@ from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import CurationError, EpisodeError, NotFittedError
 from curation_ros.core.scorers import Abstain, Look, Need, PoolScorer, Scorer
 from curation_ros.testing.episodes import copied, make_episode, make_pool, shifted, with_fields
+from curation_ros.testing.rules import Rules, expect
 
 #: What orients these comes with the episode, so they learn nothing.
 _LEARNS_NOTHING: tuple[Need, ...] = ("nothing", "object pose")
@@ -49,9 +50,9 @@ class _Case:
         return self.make().fit(self.reference)
 
 
-_Rule = Callable[[_Case], None]
 #: Rule -> its check. Each rule is a sentence about every scorer.
-SCORER_RULES: dict[str, _Rule] = {}
+SCORER_RULES: Rules[_Case] = Rules()
+_rule = SCORER_RULES.rule
 
 
 def check_scorer(
@@ -81,31 +82,11 @@ def check_scorer(
         list(reference) or make_pool(rng, 8),
         episode if episode is not None else make_episode(rng, open_at=140),
     )
-    for rule in rules or SCORER_RULES:
-        check = SCORER_RULES[rule]
-        try:
-            check(case)
-        except Exception as err:
-            found = str(err) if isinstance(err, AssertionError) else f"{type(err).__name__}: {err}"
-            raise AssertionError(f"{_name(make)} breaks a rule: {rule}: {found}") from err
-
-
-def _rule(sentence: str) -> Callable[[_Rule], _Rule]:
-    def add(check: _Rule) -> _Rule:
-        SCORER_RULES[sentence] = check
-        return check
-
-    return add
+    SCORER_RULES.check(case, _name(make), rules)
 
 
 def _name(make: Callable[[], Scorer]) -> str:
     return str(getattr(make, "__name__", make))
-
-
-def _is(condition: object, found: str) -> None:
-    """An assertion that Python's optimised mode keeps."""
-    if not condition:
-        raise AssertionError(found)
 
 
 def _state(scorer: Scorer) -> str:
@@ -120,45 +101,45 @@ def _state(scorer: Scorer) -> str:
 @_rule("It is a Scorer, and overrides `look` but not `score`.")
 def _overrides_look(case: _Case) -> None:
     scorer = case.make()
-    _is(isinstance(scorer, Scorer), f"it is a {type(scorer).__name__}")
-    _is(type(scorer).score is Scorer.score, "it overrides score")
+    expect(isinstance(scorer, Scorer), f"it is a {type(scorer).__name__}")
+    expect(type(scorer).score is Scorer.score, "it overrides score")
 
 
 @_rule("Every parameter is keyword-only, has a default, and is stored unchanged under its name.")
 def _stores_parameters(case: _Case) -> None:
     parameters = list(inspect.signature(type(case.make())).parameters.values())
     for p in parameters:
-        _is(p.kind is p.KEYWORD_ONLY, f"{p.name} is not keyword-only")
-        _is(p.default is not p.empty, f"{p.name} has no default")
+        expect(p.kind is p.KEYWORD_ONLY, f"{p.name} is not keyword-only")
+        expect(p.default is not p.empty, f"{p.name} has no default")
     given = {p.name: p.default for p in parameters}
     found = type(case.make())(**given).params()
-    _is(found == given, f"given {given}, stored {found}")
+    expect(found == given, f"given {given}, stored {found}")
 
 
 @_rule("Construction learns nothing, and default parameters are valid.")
 def _construction_learns_nothing(case: _Case) -> None:
     scorer = case.make()
     scorer.check_params()
-    _is(not scorer.fitted(), f"it holds {', '.join(scorer.fitted())} before fit")
+    expect(not scorer.fitted(), f"it holds {', '.join(scorer.fitted())} before fit")
 
 
 @_rule("`needs`, `resolution`, `version` and `choices` say what they should.")
 def _declarations(case: _Case) -> None:
     scorer = case.make()
-    _is(scorer.needs in get_args(Need), f"needs is {scorer.needs!r}, none of {get_args(Need)}")
-    _is(
+    expect(scorer.needs in get_args(Need), f"needs is {scorer.needs!r}, none of {get_args(Need)}")
+    expect(
         isinstance(scorer, PoolScorer) == (scorer.needs == "dataset"),
         "a scorer needs the dataset exactly if it is a PoolScorer",
     )
-    _is(scorer.resolution > 0, f"resolution is {scorer.resolution}, expected more than 0")
-    _is(isinstance(scorer.length_controlled, bool), "length_controlled is not a bool")
-    _is(
+    expect(scorer.resolution > 0, f"resolution is {scorer.resolution}, expected more than 0")
+    expect(isinstance(scorer.length_controlled, bool), "length_controlled is not a bool")
+    expect(
         isinstance(scorer.version, int) and scorer.version >= 1,
         f"version is {scorer.version!r}, expected 1 or more",
     )
     for name, choices in scorer.choices.items():
         value = scorer.params().get(name)
-        _is(value in choices, f"choices of {name} are {choices}, its value is {value!r}")
+        expect(value in choices, f"choices of {name} are {choices}, its value is {value!r}")
 
 
 @_rule("Labels have no way in: `look` takes an episode, `fit` takes episodes, and nothing else.")
@@ -166,7 +147,7 @@ def _no_labels(case: _Case) -> None:
     kind = type(case.make())
     for method, expected in ((kind.look, ["self", "episode"]), (kind.fit, ["self", "episodes"])):
         found = list(inspect.signature(method).parameters)
-        _is(found == expected, f"{method.__name__} takes {', '.join(found)}")
+        expect(found == expected, f"{method.__name__} takes {', '.join(found)}")
 
 
 # --- fitting ------------------------------------------------------------------------------------
@@ -188,7 +169,7 @@ def _look_before_fit(case: _Case) -> None:
 @_rule("`fit` returns the scorer.")
 def _fit_returns_self(case: _Case) -> None:
     scorer = case.make()
-    _is(scorer.fit(case.reference) is scorer, "it returned something else")
+    expect(scorer.fit(case.reference) is scorer, "it returned something else")
 
 
 @_rule("A scorer that learns refuses an empty reference with an EpisodeError and learns nothing.")
@@ -200,7 +181,7 @@ def _empty_reference(case: _Case) -> None:
     try:
         scorer.fit([])
     except EpisodeError:
-        _is(not scorer.fitted(), f"it holds {', '.join(scorer.fitted())}")
+        expect(not scorer.fitted(), f"it holds {', '.join(scorer.fitted())}")
         return
     raise AssertionError("it was fitted on nothing")
 
@@ -210,21 +191,21 @@ def _state_travels(case: _Case) -> None:
     fitted = case.fitted
     state_hash(fitted.fitted())
     travelled: Scorer = pickle.loads(pickle.dumps(fitted))
-    _is(travelled.look(case.episode) == fitted.look(case.episode), "its copy looks differently")
+    expect(travelled.look(case.episode) == fitted.look(case.episode), "its copy looks differently")
 
 
 @_rule("`fit` changes no episode.")
 def _fit_changes_no_episode(case: _Case) -> None:
     before = [e.digest for e in case.reference]
     case.make().fit(case.reference)
-    _is([e.digest for e in case.reference] == before, "an episode of the reference has changed")
+    expect([e.digest for e in case.reference] == before, "an episode of the reference has changed")
 
 
 @_rule("A second fit forgets the first.")
 def _refit_forgets(case: _Case) -> None:
     others = [_scaled(e, 1.1) for e in case.reference]
     refitted = case.make().fit(others).fit(case.reference)
-    _is(_state(refitted) == _state(case.fitted), "it remembers what it was fitted on before")
+    expect(_state(refitted) == _state(case.fitted), "it remembers what it was fitted on before")
 
 
 @_rule("The order of the dataset changes no look of a scorer that needs it.")
@@ -232,7 +213,7 @@ def _order_of_the_dataset(case: _Case) -> None:
     fitted = case.fitted
     if fitted.needs == "dataset":
         backwards = case.make().fit(list(reversed(case.reference)))
-        _is(backwards.look(case.episode) == fitted.look(case.episode), "the look depends on it")
+        expect(backwards.look(case.episode) == fitted.look(case.episode), "the look depends on it")
 
 
 # --- looking ------------------------------------------------------------------------------------
@@ -246,9 +227,9 @@ def _scores(case: _Case) -> None:
         raise AssertionError(
             f"it abstained ({reason}); pass an episode and a reference that it can score"
         ) from reason
-    _is(type(look) is Look, f"it returned a {type(look).__name__}")
-    _is(type(look.score) is float, f"the score is a {type(look.score).__name__}")
-    _is(np.isfinite(look.score), f"the score is {look.score}")
+    expect(type(look) is Look, f"it returned a {type(look).__name__}")
+    expect(type(look.score) is float, f"the score is a {type(look.score).__name__}")
+    expect(np.isfinite(look.score), f"the score is {look.score}")
 
 
 @_rule("Steps of a look lie in the episode, and an explanation is one line.")
@@ -256,12 +237,12 @@ def _steps_and_explanation(case: _Case) -> None:
     look, n = case.fitted.look(case.episode), len(case.episode)
     if look.steps is not None:
         first, last = look.steps
-        _is(0 <= first <= last < n, f"steps are {look.steps}, the episode has {n}")
+        expect(0 <= first <= last < n, f"steps are {look.steps}, the episode has {n}")
     if look.broke_at is not None:
-        _is(0 <= look.broke_at < n, f"broke_at is {look.broke_at}, the episode has {n} steps")
+        expect(0 <= look.broke_at < n, f"broke_at is {look.broke_at}, the episode has {n} steps")
     if look.explanation is not None:
         lines = look.explanation.strip().splitlines()
-        _is(len(lines) == 1, f"the explanation is {look.explanation!r}")
+        expect(len(lines) == 1, f"the explanation is {look.explanation!r}")
 
 
 @_rule("A look changes neither scorer nor episode, and a second one is equal.")
@@ -269,10 +250,10 @@ def _look_changes_nothing(case: _Case) -> None:
     fitted = case.fitted
     state, digest = _state(fitted), case.episode.digest
     first = fitted.look(case.episode)
-    _is(_state(fitted) == state, "the scorer has changed")
-    _is(case.episode.digest == digest, "the episode has changed")
-    _is(fitted.look(case.episode) == first, "the second look differs")
-    _is(fitted.look(replace(case.episode)) == first, "the look at an equal episode differs")
+    expect(_state(fitted) == state, "the scorer has changed")
+    expect(case.episode.digest == digest, "the episode has changed")
+    expect(fitted.look(case.episode) == first, "the second look differs")
+    expect(fitted.look(replace(case.episode)) == first, "the look at an equal episode differs")
 
 
 @_rule("A look does not depend on other episodes that are looked at.")
@@ -281,20 +262,22 @@ def _looks_are_independent(case: _Case) -> None:
     batch = [case.episode, _scaled(case.episode, 1.05), *case.reference[:3]]
     forwards = [_look_or_reason(fitted, e) for e in batch]
     backwards = [_look_or_reason(fitted, e) for e in reversed(batch)]
-    _is(forwards == backwards[::-1], "looks depend on the order of the episodes")
+    expect(forwards == backwards[::-1], "looks depend on the order of the episodes")
 
 
 @_rule("Id and name of an episode do not matter.")
 def _identity_does_not_matter(case: _Case) -> None:
     fitted = case.fitted
     copy = copied(case.episode, id="another", name="other")
-    _is(fitted.look(copy) == fitted.look(case.episode), "a copy with another id looks different")
+    expect(
+        fitted.look(copy) == fitted.look(case.episode), "a copy with another id looks different"
+    )
 
 
 @_rule("The time at which an episode was recorded does not matter.")
 def _time_does_not_matter(case: _Case) -> None:
     later = case.make().fit([shifted(e, _HOUR_NS) for e in case.reference])
-    _is(
+    expect(
         later.look(shifted(case.episode, _HOUR_NS)) == case.fitted.look(case.episode),
         "an hour later the look differs",
     )
@@ -308,10 +291,10 @@ def _degenerate_episodes(case: _Case) -> None:
             warnings.simplefilter("error")
             try:
                 score = fitted.look(episode).score
-                _is(np.isfinite(score), f"{what}: its score is {score}")
+                expect(np.isfinite(score), f"{what}: its score is {score}")
             except Abstain as reason:
                 n = len(str(reason))
-                _is(0 < n <= _LONGEST_REASON, f"{what}: the reason has {n} characters")
+                expect(0 < n <= _LONGEST_REASON, f"{what}: the reason has {n} characters")
             except (CurationError, Warning, ArithmeticError, LookupError, ValueError) as err:
                 raise AssertionError(f"{what}: {type(err).__name__}: {err}") from err
 
@@ -322,7 +305,7 @@ def _another_robot(case: _Case) -> None:
         score = case.fitted.look(_wider(case.episode)).score
     except Abstain:
         return
-    _is(np.isfinite(score), f"its score is {score}")
+    expect(np.isfinite(score), f"its score is {score}")
 
 
 def _look_or_reason(scorer: Scorer, episode: Episode) -> Look | str:

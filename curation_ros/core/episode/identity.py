@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import uuid
 from collections.abc import Iterable
 
@@ -9,10 +10,17 @@ from uuid6 import uuid7
 
 from curation_ros.core.errors import EpisodeError
 
+_UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+
 
 def new_episode_id() -> str:
     """Mint a UUID version 7: unique anywhere, sortable by the time of its minting."""
     return str(uuid7())
+
+
+def is_uuid(text: str) -> bool:
+    """Whether a text has the form in which ids are minted."""
+    return _UUID.fullmatch(text) is not None
 
 
 def foreign_episode_id(sha256_hex: str, start_ns: int) -> str:

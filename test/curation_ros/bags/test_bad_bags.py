@@ -27,7 +27,7 @@ from curation_ros.core.errors import BagError, ConfigError, CurationError, Episo
 from curation_ros.core.evidence.baseline import Baseline
 from curation_ros.core.evidence.checks import check_episode
 from curation_ros.dataset.dataset import Dataset
-from curation_ros.dataset.episodes import find_bags, read_episode
+from curation_ros.dataset.episodes import find_episodes, read_episode
 
 #: Of everything that reads one bad bag; a chunk of the largest size is not among them.
 MOST_MEMORY_BYTES = 150 << 20
@@ -57,7 +57,7 @@ def _findings(path: Path, curation: Curation, known: set[str]) -> set[str]:
     """Ids of what is wrong with a bag, as `curation score` comes to them."""
     error = None
     try:
-        [bag] = find_bags([path])
+        [bag] = find_episodes([path])
         episode = read_episode(bag)
     except CurationError as err:
         error = err
@@ -144,7 +144,7 @@ def test_bad_bags_are_named_and_the_others_scored(
     folder, paths = heap
     sound = bench.bag(tmp_path / "sound")
     # What no scan of a folder takes for a bag, a person may still name.
-    scanned = {p.resolve() for p in find_bags([folder])}
+    scanned = {p.resolve() for p in find_episodes([folder])}
     named = [p for p in paths.values() if p.is_symlink() or p.resolve() not in scanned]
     code, rows, err = score(sound, folder, *named)
     assert code == 0
@@ -185,11 +185,11 @@ import resource, sys
 limit = int(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 from pathlib import Path
-from curation_ros.dataset.episodes import find_bags, read_episode
+from curation_ros.dataset.episodes import find_episodes, read_episode
 from curation_ros.core.errors import CurationError
 for name in sys.argv[2:]:
     try:
-        read_episode(find_bags([Path(name)])[0])
+        read_episode(find_episodes([Path(name)])[0])
     except CurationError as err:
         print(err.finding)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)

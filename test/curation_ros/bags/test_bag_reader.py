@@ -37,7 +37,7 @@ from curation_ros.bags.mcap_info import read_info
 from curation_ros.core.episode.builder import EpisodeBuilder
 from curation_ros.core.episode.topic_map import TopicMap, topic_map_from_json
 from curation_ros.core.errors import BagError, ConfigError
-from curation_ros.dataset.episodes import find_bags, read_episode
+from curation_ros.dataset.episodes import read_episode
 
 POSE_TEXT = message_schema(POSE).text.encode()
 
@@ -548,44 +548,8 @@ def test_custom_data_that_makes_no_sense_is_a_bag_error(
         read_episode(tmp_path / "ep")
 
 
-def test_find_bags_expands_datasets_folders_and_files(tmp_path: Path) -> None:
-    dataset = tmp_path / "data"
-    for name in ("b", "a"):
-        write_bag(dataset / "episodes" / name, episode_messages(1))
-    write_bag(dataset / "episodes" / ".partial" / "c", episode_messages(1))
-    (dataset / "episodes" / "notes").mkdir()
-    flat = tmp_path / "flat"
-    flat.mkdir()
-    for k in (10, 9):
-        shutil.copy(dataset / "episodes/a/a_0.mcap", flat / f"demo_{k}.mcap")
-    (flat / "readme.txt").write_text("")
-    one = dataset / "episodes" / "b"
-    assert find_bags([one, dataset]) == [one, dataset / "episodes" / "a"]
-    assert find_bags([dataset / "episodes"]) == [dataset / "episodes" / "a", one]
-    assert find_bags([flat]) == [flat / "demo_9.mcap", flat / "demo_10.mcap"]
-    assert find_bags([one / "b_0.mcap"]) == [one / "b_0.mcap"]
-    with pytest.raises(BagError, match="name one of them"):
-        open_bag(flat)
-    with pytest.raises(BagError, match="has no bag in it"):
-        find_bags([dataset, dataset / "episodes" / "notes"])
-    with pytest.raises(BagError, match="no such path"):
-        find_bags([tmp_path / "nowhere"])
-
-
-def test_folder_of_datasets_is_told_from_a_dataset(tmp_path: Path) -> None:
-    (tmp_path / "notes").mkdir()
-    with pytest.raises(BagError, match=r"has no bag in it$"):
-        find_bags([tmp_path])
-    for name in ("ann", "ben"):
-        (tmp_path / name / "episodes").mkdir(parents=True)
-    with pytest.raises(BagError, match=r"has no bag in it: did you mean .*ann or .*ben[?]$"):
-        find_bags([tmp_path])
-
-
-def test_episodes_are_found_in_the_order_of_their_ids(tmp_path: Path) -> None:
-    ids = ["01a20164-99af-7f9c-803d-7ad12c0caf76", "01a20164-9be8-79b2-a1b7-789d4261dc45"]
-    for episode_id in ids:
-        folder = tmp_path / "episodes" / episode_id
-        folder.mkdir(parents=True)
-        (folder / "metadata.yaml").touch()
-    assert [path.name for path in find_bags([tmp_path])] == ids
+def test_folder_of_several_recordings_is_no_bag(tmp_path: Path) -> None:
+    for k in (1, 2):
+        shutil.copy(write_bag(tmp_path / str(k), episode_messages(1)).path, tmp_path / f"{k}.mcap")
+    with pytest.raises(BagError, match=r"has 2 \.mcap files .* name one of them"):
+        open_bag(tmp_path)

@@ -11,7 +11,7 @@ from streams import record
 
 from curation_ros.bags import open_bag
 from curation_ros.dataset.dataset import Dataset
-from curation_ros.dataset.episodes import find_bags
+from curation_ros.dataset.episodes import find_episodes
 
 DONE, USAGE, NOTHING = 0, 2, 3
 EARLY = ("pick-2", "pick-3")
@@ -31,7 +31,7 @@ Run = Callable[..., Any]
 def told_data(folder: Path) -> Path:
     """The dataset with its truth: pick-2 and pick-3 are early releases that failed."""
     dataset = Dataset(folder / "data")
-    for bag in find_bags([folder / "data"]):
+    for bag in find_episodes([folder / "data"]):
         event = open_bag(bag).event()
         assert event is not None
         early = event.name in EARLY

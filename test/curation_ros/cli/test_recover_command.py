@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from curation_ros.bags import open_bag
-from curation_ros.dataset.episodes import find_bags
+from curation_ros.dataset.episodes import find_episodes
 
 Run = Callable[..., Any]
 
@@ -13,7 +13,7 @@ Run = Callable[..., Any]
 def test_damaged_bag_is_saved_and_scored_with_its_finding(
     curation: Run, folder: Path, tmp_path: Path
 ) -> None:
-    bag = find_bags([folder / "data"])[0]
+    bag = find_episodes([folder / "data"])[0]
     whole = sum(topic.count for topic in open_bag(bag).topics.values())
     torn = next(bag.glob("*.mcap"))
     torn.write_bytes(torn.read_bytes()[: torn.stat().st_size // 2])

@@ -18,7 +18,7 @@ from curation_ros.core.decision.curation import Curation
 from curation_ros.core.episode.findings import FINDINGS
 from curation_ros.core.scorers import DEFAULT_SCORERS
 from curation_ros.dataset.dataset import Dataset
-from curation_ros.dataset.episodes import find_bags, read_episode
+from curation_ros.dataset.episodes import find_episodes, read_episode
 
 DONE, FOUND, USAGE, NOTHING = 0, 1, 2, 3
 KEYS = ["episode", "name", "path", "length", "scores", "decision", "reason", "span", "findings"]
@@ -32,7 +32,7 @@ def _options(folder: Path) -> list[object]:
 
 
 def _bag(folder: Path, name: str = "pick-0") -> Path:
-    for path in find_bags([folder / "data"]):
+    for path in find_episodes([folder / "data"]):
         event = open_bag(path).event()
         if event is not None and event.name == name:
             return path

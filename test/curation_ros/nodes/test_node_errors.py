@@ -46,7 +46,7 @@ FILES = {
 #: Name -> (node, parameters, what the line says); {} is the folder of the files.
 CASES = {
     "reference_missing": ("curator", {"reference": ["{}/nowhere"]}, "nowhere: no such path"),
-    "reference_empty": ("curator", {"reference": ["{}/empty"]}, "empty has no bag in it"),
+    "reference_empty": ("curator", {"reference": ["{}/empty"]}, "empty has no episode in it"),
     "scorer_unknown": ("curator", {"scorers": ["magic"]}, "no scorer 'magic'; there are"),
     "rule_unknown": ("curator", {"rule": "magic"}, "no rule 'magic'; there are"),
     "map_no_yaml": ("curator", {"topic_map": "{}/broken.yaml"}, "broken.yaml is not YAML"),
