@@ -1,17 +1,18 @@
-"""How well the scorers of consequence tell a lost object, and what the curator makes of it.
+"""How well lost objects are detected, and what the curator decides then.
 
     python benchmarks/consequence.py FOLDER [--json] [--jobs N]
 
-gives, by what a graph shows: clean demonstrations flagged, losses found and how late, by each
-detector alone and by the alert that the curator sends while an episode runs; then the verdicts of
-the curator as it is without configuration, and where it cuts what it salvages.
+reports for each set of published topics: clean demonstrations flagged, losses found, and the
+delay, by each detector alone and by the alert that the curator sends during an episode. It then
+reports the verdicts of the curator with its default configuration, and where it cuts what it
+salvages.
 
-It collects, where FOLDER does not have them yet, 260 clean and 260 defective demonstrations (every
-defect of the simulator in turn) on generated starts, without ROS. The constants of the detectors
-were chosen on seed 101 (20 and 20), and on the shape of the paper's data (seeds 11 and 13); the
-figures are those of seeds 107 to 112 (240 and 240), which chose nothing. A demonstration without
-a defect that failed all the same (the bowl may slip) is not clean; it is counted by itself. Bounds
-are Clopper and Pearson's, of 95 %.
+It collects the demonstrations that FOLDER lacks: 260 clean and 260 defective ones (every defect of
+the simulator in turn) from generated start states, without ROS. The constants of the detectors
+were chosen on seed 101 (20 and 20), and on the paper's data (seeds 11 and 13). The results are for
+seeds 107 to 112 (240 and 240), which no constant was chosen on. A demonstration can fail without a
+defect, because the bowl may slip. It is counted separately and not as clean. Bounds are Clopper
+and Pearson's, of 95 %.
 """
 
 from __future__ import annotations
@@ -60,7 +61,12 @@ _LEFT_M = 0.005
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a detector says: whether something was lost, None: it does not know; and since when."""
+    """What a detector found.
+
+    Attributes:
+        is_lost: whether the object was lost; None if it cannot be known.
+        noticed: step at which the loss was noticed.
+    """
 
     is_lost: bool | None
     noticed: int | None = None
@@ -79,7 +85,7 @@ class Tally:
 def collected(
     folder: Path, seeds: tuple[int, ...], jobs: int
 ) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Bags of the episodes of some seeds with their truth, collected where they are missing."""
+    """Bags and truth of the episodes of some seeds; missing ones are collected first."""
     kinds = [name for name in DEFECTS if name != "none"]
     for seed in seeds:
         for k, defect in enumerate(kinds):
@@ -101,7 +107,7 @@ def collected(
 
 
 def with_effort(topic_map: TopicMap) -> TopicMap:
-    """The map with a field for the efforts of the fingers, which our bags have anyway."""
+    """The map with a field for the efforts of the fingers, which are in the same messages."""
     raw = topic_map.to_json()
     fingers = raw["fields"]["finger_position"]
     paths = [path.replace("position.", "effort.") for path in fingers["values"]]
@@ -110,7 +116,7 @@ def with_effort(topic_map: TopicMap) -> TopicMap:
 
 
 def without(episode: Episode, *missing: str) -> Episode:
-    """The same episode of a graph that does not publish some roles, or fields.
+    """The same episode from a graph that does not publish some roles or fields.
 
     Args:
         episode: as recorded.
@@ -128,10 +134,10 @@ def without(episode: Episode, *missing: str) -> Episode:
 
 
 def degraded(episode: Episode, rng: np.random.Generator) -> Episode:
-    """The same episode with poses of objects as a poor tracker gives them.
+    """The same episode with object poses from a poor tracker.
 
-    Noise of 10 mm in each axis, 100 ms late by its stamps, and of 100 poses 30 are missing: as
-    everywhere, the last one is then held.
+    They have noise of 10 mm in each axis and a delay of 100 ms. Of 100 poses 30 are missing, and
+    the last one is held instead.
     """
     fields = dict(episode.fields)
     steps = np.arange(len(episode))
@@ -162,7 +168,7 @@ def _of_events(episode: Episode) -> Verdict:
     return Verdict(is_lost, look.steps[0] if look.steps is not None else None)
 
 
-#: What is given -> what a detector makes of an episode.
+#: Detector and its input -> what it finds in an episode.
 DETECTORS: dict[str, Callable[[Episode, np.random.Generator], Verdict]] = {
     "object, exact pose": lambda e, _: _of(carrying_of(e)),
     "object, 10 mm noise, 100 ms delay, 30 % dropout": lambda e, rng: _of(
@@ -177,7 +183,7 @@ DETECTORS: dict[str, Callable[[Episode, np.random.Generator], Verdict]] = {
 }
 
 
-#: What a graph shows -> the episode as it is then. The last two need a trusted reference.
+#: Published topics -> the episode as it is then. The last two need a trusted reference.
 GRAPHS: dict[str, Callable[[Episode, np.random.Generator], Episode]] = {
     "everything": lambda e, _: e,
     "object with 10 mm noise, 100 ms delay, 30 % dropout": degraded,
@@ -211,14 +217,14 @@ def left_at(episode: Episode, release_step: int) -> int:
 
 
 def kind_of(truth: dict[str, Any]) -> str:
-    """What an episode was: `defective`; without a defect `clean`, or `failed` all the same."""
+    """Kind of an episode: `defective`, or without a defect `clean` or `failed`."""
     if truth["defect"] != "none":
         return "defective"
     return "clean" if truth["outcome"] == "succeeded" else "failed"
 
 
 def tallies(folder: Path, seeds: tuple[int, ...], jobs: int) -> dict[str, Tally]:
-    """What each detector says of the episodes of some seeds."""
+    """What each detector finds in the episodes of some seeds."""
     topic_map = with_effort(topic_map_or_default(""))
     found = {name: Tally() for name in DETECTORS}
     for path, truth in collected(folder, seeds, jobs):
@@ -276,7 +282,7 @@ def text(line: dict[str, Any]) -> str:
 
 
 def decisions(folder: Path, seeds: tuple[int, ...], jobs: int) -> Iterator[dict[str, Any]]:
-    """A line a graph: verdicts of the curator, and where it cuts."""
+    """A line per set of published topics: verdicts of the curator, and where it cuts."""
     trusted = [
         (read_episode(path), _rng(truth))
         for path, truth in collected(folder, CHOSEN_ON, jobs)
@@ -308,7 +314,7 @@ def decisions(folder: Path, seeds: tuple[int, ...], jobs: int) -> Iterator[dict[
 
 
 def _rng(truth: dict[str, Any]) -> np.random.Generator:
-    """Of an episode: the same whoever asks."""
+    """Random numbers of an episode, the same for every detector."""
     return np.random.default_rng(zlib.crc32(f"{truth['start']} {truth['name']}".encode()))
 
 
@@ -325,11 +331,11 @@ def decision_text(line: dict[str, Any]) -> str:
 
 
 def main() -> int:
-    """Collect what is missing, and report."""
+    """Collect the missing demonstrations, and report."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, metavar="FOLDER")
-    parser.add_argument("--json", action="store_true", help="a JSON line a row")
-    parser.add_argument("--jobs", type=int, default=2, help="simulators at once")
+    parser.add_argument("--json", action="store_true", help="print a JSON line per row")
+    parser.add_argument("--jobs", type=int, default=2, help="number of simulators")
     args = parser.parse_args()
     for title, seeds in (("chosen on", CHOSEN_ON), ("reported", REPORTED)):
         if not args.json:

@@ -1,0 +1,139 @@
+"""Bags in the form that our recorder writes, for benchmarks of reading."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from curation_ros.bags import BagWriter
+from curation_ros.bags.messages import to_cdr
+from curation_ros.core.episode import messages
+from curation_ros.core.episode.identity import new_episode_id
+from curation_ros.core.episode.messages import JOINT_STATE, POSE, STATUS_ARRAY, TWIST, PlainMessage
+from curation_ros.core.episode.status import EpisodeEvent, event_to_json, phase_to_status
+from curation_ros.core.episode.topic_map import TopicMap
+
+N_MESSAGES = 5000
+N_STEPS = 350
+STEP_NS = 50_000_000
+START_NS = 1_781_000_000_000_000_000
+#: Steps per chunk. The recorder flushes every 0.1 s, which ends a chunk. In that time the
+#: simulator makes about 25 steps in lockstep, and a robot at 20 Hz makes 2.
+STEPS_PER_CHUNK = {"lockstep": 25, "20 Hz": 2}
+ARM = [f"robot0_joint{k}" for k in range(1, 8)] + [f"gripper0_finger_joint{k}" for k in (1, 2)]
+_QUAT_XYZW = (1.0, 0.0, 0.0, 0.0)
+_PLATE_M = (0.05, 0.2, 0.9)
+
+
+def _write(writer: BagWriter, message: PlainMessage, stamp_ns: int, number: int) -> None:
+    topic = f"/{message.topic}"
+    writer.add_topic(topic, message.type)
+    data = to_cdr(message.type, message.content)
+    writer.write(topic, stamp_ns + 2_000_000, stamp_ns, number, data)
+
+
+def write_topic(folder: Path, type_name: str) -> Path:
+    """Write a bag with many messages of one topic.
+
+    Args:
+        folder: of the bag.
+        type_name: JOINT_STATE or POSE.
+
+    Returns:
+        The file of the bag.
+    """
+    rng = np.random.default_rng(1)
+    writer = BagWriter(folder, folder.name)
+    for k in range(N_MESSAGES):
+        stamp_ns = START_NS + k * STEP_NS
+        if type_name == JOINT_STATE:
+            position, velocity, effort = rng.standard_normal((3, len(ARM)))
+            content = messages.joint_state(ARM, position, velocity, effort, stamp_ns)
+        else:
+            values = rng.standard_normal(7)
+            content = messages.pose(values[:3], values[3:], stamp_ns)
+        _write(writer, PlainMessage("topic", type_name, content), stamp_ns, k + 1)
+        if (k + 1) % STEPS_PER_CHUNK["lockstep"] == 0:
+            writer.flush()
+    writer.close()
+    return writer.path
+
+
+def write_episode(folder: Path, topic_map: TopicMap, number: int, pace: str) -> EpisodeEvent:
+    """Write a pick-and-place demonstration of the LIBERO robot.
+
+    Args:
+        folder: of the bag.
+        topic_map: stored in the bag.
+        number: of the episode; motion, durations and goal vary with it.
+        pace: one of STEPS_PER_CHUNK.
+
+    Returns:
+        The event at the end of the episode.
+    """
+    rng = np.random.default_rng(number)
+    edges = np.cumsum([0, 60, 45, 20, 60, 130]) + np.concatenate([[0], rng.integers(-6, 7, 5)])
+    phase = np.searchsorted(edges, np.arange(N_STEPS), side="right") - 1
+    ways = np.array(
+        [[0.3, 0.2, -0.2], [0, 0, -0.6], [0, 0, 0], [0, 0, 0.6], [0.2, 0.4, -0.1], [0, 0, 0]]
+    )
+    twist = np.clip(
+        (ways + 0.05 * rng.standard_normal(ways.shape))[phase]
+        + 0.02 * rng.standard_normal((N_STEPS, 3)),
+        -1,
+        1,
+    )
+    eef = np.array([0.0, 0.0, 1.2]) + np.cumsum(twist * 0.013, axis=0)
+    is_closed = (phase >= 2) & (phase < 5)
+    width = np.convolve(np.where(is_closed, 0.012, 0.08), np.ones(4) / 4, mode="full")[:N_STEPS]
+    width[:3] = 0.08
+    joints = np.cumsum(0.01 * rng.standard_normal((N_STEPS, 3, len(ARM))), axis=0)
+    joints[:, 0, 7:] = np.column_stack([width / 2, -width / 2])
+    bowl = np.where(is_closed[:, None], eef, eef[int(np.argmax(is_closed))])
+    stamps = START_NS + STEP_NS * (np.arange(N_STEPS) + 1)
+    event = EpisodeEvent(
+        new_episode_id(),
+        f"bench-{number:04d}",
+        "ended",
+        START_NS,
+        int(stamps[-1]),
+        dict.fromkeys(topic_map.topics, N_STEPS),
+    )
+    writer = BagWriter(
+        folder,
+        folder.name,
+        custom_data={
+            "episode": json.dumps(event_to_json(event)),
+            "topic_map": json.dumps(topic_map.to_json()),
+            "topics": json.dumps({topic: f"/{topic}" for topic in topic_map.topics}),
+        },
+    )
+    [labels] = [spec.labels for spec in topic_map.with_role("phase")]
+    for k, t in enumerate(stamps.tolist()):
+        position, velocity, effort = joints[k]
+        gripper = [1.0] if is_closed[k] else [-1.0]
+        label, progress = labels[phase[k]], (k - edges[phase[k]]) / N_STEPS
+        status = phase_to_status(event.id, label, int(phase[k]), float(progress))
+        contents = {
+            "eef_pose": (POSE, messages.pose(eef[k], _QUAT_XYZW, t)),
+            "joint_states": (
+                JOINT_STATE,
+                messages.joint_state(ARM, position, velocity, effort, t),
+            ),
+            "objects/akita_black_bowl_1/pose": (POSE, messages.pose(bowl[k], _QUAT_XYZW, t)),
+            "objects/plate_1/pose": (POSE, messages.pose(_PLATE_M, _QUAT_XYZW, t)),
+            "phase": (STATUS_ARRAY, messages.status_array([status], t)),
+            "command/twist": (TWIST, messages.twist(twist[k], t)),
+            "command/gripper": (
+                JOINT_STATE,
+                messages.joint_state(["gripper"], gripper, [0.0], [0.0], t),
+            ),
+        }
+        for topic, (type_name, content) in contents.items():
+            _write(writer, PlainMessage(topic, type_name, content), t, k + 1)
+        if (k + 1) % STEPS_PER_CHUNK[pace] == 0:
+            writer.flush()
+    writer.close()
+    return event
