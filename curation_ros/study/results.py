@@ -6,6 +6,7 @@ import importlib.metadata
 import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from datetime import datetime, timezone
 from statistics import mean
 from typing import Any
@@ -16,11 +17,11 @@ from curation_ros.core.statistics.rank_correlation import rank_correlation_exact
 from curation_ros.core.statistics.seeds import deviations, modes, seed_counts
 from curation_ros.core.statistics.significance import holm
 from curation_ros.core.statistics.success import Outcomes, contrast, gap_closed, success_rate
+from curation_ros.core.types import JsonObject
 from curation_ros.study.plan import Contrast, Stage, StudyPlan
 from curation_ros.study.results_format import FORMAT
 from curation_ros.study.running import Cell, Study
 from curation_ros.study.terms import parse_row
-from curation_ros.study.units import Row
 from curation_ros.version import __version__
 
 _PACKAGES = (
@@ -34,7 +35,7 @@ _SHOWN = ("effector", "object", "gripper", "phase")
 _FREE = {"nothing", "dataset"}
 
 
-def results(study: Study) -> Row:
+def results(study: Study) -> JsonObject:
     """The content of `results.json`; docs/study.md names the keys."""
     plan, trials = study.plan, study.trials
     rollouts = {
@@ -107,7 +108,7 @@ def _left_out(plan: StudyPlan) -> list[str]:
     return [name for name in names if name not in done]
 
 
-def _example(study: Study) -> Row:
+def _example(study: Study) -> JsonObject:
     """A salvaged episode with its decision, for the picture in the report."""
     for name, pool in study.pools.items():
         if pool.curated is None or pool.curated.example is None:
@@ -138,7 +139,9 @@ def _keep_counts(study: Study) -> list[int]:
     return sorted({*counts, study.plan.keep_for_audit})
 
 
-def _stage(study: Study, stage: Stage, rollouts: Mapping[tuple[str, str], Row]) -> Row:
+def _stage(
+    study: Study, stage: Stage, rollouts: Mapping[tuple[str, str], JsonObject]
+) -> JsonObject:
     from sim_node.tasks import start_names
 
     starts = start_names(stage.starts)
@@ -165,7 +168,7 @@ def _key(cell: Cell) -> tuple[str, str, str]:
 
 
 def _outcomes(
-    cell: Cell, starts: Sequence[str], rollouts: Mapping[tuple[str, str], Row]
+    cell: Cell, starts: Sequence[str], rollouts: Mapping[tuple[str, str], JsonObject]
 ) -> Outcomes:
     return {
         (seed, start): bool(rollouts[policy, start]["success"])
@@ -179,9 +182,9 @@ def _row(
     study: Study,
     cell: Cell,
     starts: Sequence[str],
-    rollouts: Mapping[tuple[str, str], Row],
+    rollouts: Mapping[tuple[str, str], JsonObject],
     outcomes: Outcomes,
-) -> Row:
+) -> JsonObject:
     """A training set in a stage, with all counts."""
     done = [
         rollouts[policy, start]
@@ -195,7 +198,7 @@ def _row(
     audited: Mapping[str, Any] = next((r for r in pool.audited if r["scorer"] == scorer), {})
     # Rows are ranked by the score under length control, and `length` by the raw one.
     raw = is_scorer(scorer) and not find_scorer(scorer).length_controlled
-    row: Row = {
+    return {
         "variant": cell.variant,
         **_sets(cell, study.timelines),
         "scorer": scorer,
@@ -213,32 +216,30 @@ def _row(
         "stages_reached": _counted(r["stage"] for r in done if not r["success"]),
         "ended": _counted(r["ended"] for r in done),
         "mean_steps_of_successes": mean([r["steps"] for r in done if r["success"]] or [0]) or None,
-        "rate": None,
-        "interval": None,
-        "sd": None,
-        "sd_population": None,
-        "counts": [],
-        "modes": None,
-        "is_degenerate": False,
+        **_success(outcomes),
     }
-    if outcomes:
-        estimate = success_rate(outcomes)
-        counts = seed_counts(outcomes)
-        sd, population = deviations([c.successes / c.n for c in counts])
-        found = modes(counts)
-        row |= {
-            "rate": estimate.value,
-            "interval": estimate.interval,
-            "is_degenerate": estimate.is_degenerate,
-            "sd": sd,
-            "sd_population": population,
-            "counts": [{"seed": c.seed, "successes": c.successes, "n": c.n} for c in counts],
-            "modes": {"low": found.low, "middle": found.middle, "high": found.high},
-        }
-    return row
 
 
-def _sets(cell: Cell, timelines: Mapping[str, Episode]) -> Row:
+def _success(outcomes: Outcomes) -> JsonObject:
+    """Success rate of a training set, and the counts behind it."""
+    if not outcomes:
+        empty = dict.fromkeys(("rate", "interval", "sd", "sd_population", "modes"))
+        return {**empty, "counts": [], "is_degenerate": False}
+    estimate = success_rate(outcomes)
+    counts = seed_counts(outcomes)
+    sd, population = deviations([c.successes / c.n for c in counts])
+    return {
+        "rate": estimate.value,
+        "interval": estimate.interval,
+        "sd": sd,
+        "sd_population": population,
+        "counts": [{"seed": c.seed, "successes": c.successes, "n": c.n} for c in counts],
+        "modes": asdict(modes(counts)),
+        "is_degenerate": estimate.is_degenerate,
+    }
+
+
+def _sets(cell: Cell, timelines: Mapping[str, Episode]) -> JsonObject:
     """Content of the training set; means without ids if it is drawn again for each seed."""
     different = {made.id: made for made in cell.sets.values()}
     described = [made.to_json(timelines) for made in different.values()]
@@ -265,7 +266,7 @@ def _counted(values: Iterable[str]) -> dict[str, int]:
     return dict(sorted(found.items(), key=lambda item: (-item[1], item[0])))
 
 
-def _compare(rows: list[Row]) -> None:
+def _compare(rows: list[JsonObject]) -> None:
     """Add the gap closed, and for each scorer the best row without one that needs no more."""
     for row in rows:
         same = [r for r in rows if (r["pool"], r["variant"]) == (row["pool"], row["variant"])]
@@ -290,9 +291,9 @@ def _compare(rows: list[Row]) -> None:
             row["rival"] = {"row": rival, "rate": rate, "difference": row["rate"] - rate}
 
 
-def _correlations(rows: Sequence[Row]) -> Iterable[Row]:
+def _correlations(rows: Sequence[JsonObject]) -> Iterable[JsonObject]:
     """Detection against success, over the scorers of the paper at one number kept."""
-    groups: dict[tuple[str, str, int], list[Row]] = {}
+    groups: dict[tuple[str, str, int], list[JsonObject]] = {}
     for row in rows:
         usable = row["rate"] is not None and row["auroc"] is not None and row["keep"]
         if usable and row["scorer"] != "length" and "+" not in row["row"]:
@@ -318,15 +319,15 @@ def _correlations(rows: Sequence[Row]) -> Iterable[Row]:
 def _contrasts(
     planned: Sequence[Contrast],
     outcomes: Mapping[tuple[str, str, str], Outcomes],
-    rows: Sequence[Row],
-) -> list[Row]:
+    rows: Sequence[JsonObject],
+) -> list[JsonObject]:
     """Planned comparisons, adjusted for their number; those without data count, too."""
-    found: list[Row] = []
+    found: list[JsonObject] = []
     p_values: dict[str, float | None] = {}
     sets = {(r["pool"], r["variant"], r["row"]): r["set"] for r in rows}
     for k, one in enumerate(planned):
         a, b = (one.pool, one.variant, one.a), (one.pool, one.variant, one.b)
-        row: Row = {
+        row: JsonObject = {
             "a": one.a,
             "b": one.b,
             "pool": one.pool,

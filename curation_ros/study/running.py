@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from curation_ros.core.episode.episode import Episode
+from curation_ros.core.types import JsonObject
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.episodes import read_all_episodes
 from curation_ros.files import append_line, named_errors, read_lines
@@ -19,7 +20,7 @@ from curation_ros.study.pools import Pool, score_pool
 from curation_ros.study.terms import parse_row
 from curation_ros.study.training_sets import TrainingSet, training_set
 from curation_ros.study.trials import PolicyTrials, Work
-from curation_ros.study.units import PolicyUnit, RolloutUnit, Row
+from curation_ros.study.units import PolicyUnit, RolloutUnit
 
 #: Called with a line about each part of a study.
 Log = Callable[[str], None]
@@ -85,7 +86,7 @@ class Study:
     reference: Dataset
     cells: tuple[Cell, ...]
     problems: tuple[str, ...]
-    seconds: tuple[Row, ...]
+    seconds: tuple[JsonObject, ...]
     n_reference: int
     timelines: Mapping[str, Episode] = field(default_factory=dict)
 
@@ -128,16 +129,7 @@ def run_study(
     with clock.measured("collect") as fact:
         datasets, fact["units"] = collect_datasets(data, plan, jobs=jobs, backend=backend, log=log)
     reference = read_all_episodes(datasets["reference"], "reference")
-    timelines = {e.id: timeline_of(e) for e in reference}
-    if "more" in datasets:
-        further = read_all_episodes(datasets["more"], "more")
-        timelines |= {e.id: timeline_of(e) for e in further}
-    pools = {}
-    with clock.measured("score and audit"):
-        for name in plan.pools:
-            pools[name] = score_pool(name, datasets[name], reference, plan)
-            timelines |= pools[name].timelines
-            log(f"pool {name}: {len(plan.scorers)} scorers, {pools[name].facts['n']} scored")
+    pools = _score_pools(plan, datasets, reference, clock, log)
     trials = PolicyTrials(
         folder,
         jobs=jobs,
@@ -164,8 +156,34 @@ def run_study(
         problems=tuple(dict.fromkeys(found)),
         seconds=tuple(clock.all()),
         n_reference=len(reference),
-        timelines=timelines,
+        timelines=_timelines(datasets, reference, pools),
     )
+
+
+def _score_pools(
+    plan: StudyPlan,
+    datasets: Mapping[str, Dataset],
+    reference: Sequence[Episode],
+    clock: _Clock,
+    log: Log,
+) -> dict[str, Pool]:
+    pools = {}
+    with clock.measured("score and audit"):
+        for name in plan.pools:
+            pools[name] = score_pool(name, datasets[name], reference, plan)
+            log(f"pool {name}: {len(plan.scorers)} scorers, {pools[name].facts['n']} scored")
+    return pools
+
+
+def _timelines(
+    datasets: Mapping[str, Dataset], reference: Sequence[Episode], pools: Mapping[str, Pool]
+) -> dict[str, Episode]:
+    """Id -> demonstration with only its phases and stamps, of all datasets."""
+    further = read_all_episodes(datasets["more"], "more") if "more" in datasets else []
+    timelines = {e.id: timeline_of(e) for e in (*reference, *further)}
+    for pool in pools.values():
+        timelines |= pool.timelines
+    return timelines
 
 
 def _cells(
@@ -220,7 +238,7 @@ def _train(
     }
     n = 0
 
-    def tick(row: Row) -> None:
+    def tick(row: JsonObject) -> None:
         nonlocal n
         n += 1
         ticks(f"{label}: trained", n, len(units))
@@ -245,7 +263,7 @@ def _roll(
     ]
     wanted, n = len(set(units)), 0
 
-    def tick(row: Row) -> None:
+    def tick(row: JsonObject) -> None:
         nonlocal n
         n += 1
         ticks(f"{label}: rolled out", n, wanted)
@@ -269,9 +287,9 @@ class _Clock:
         self._path, self._writes = path, writes
 
     @contextmanager
-    def measured(self, what: str, part: str = "") -> Iterator[Row]:
+    def measured(self, what: str, part: str = "") -> Iterator[JsonObject]:
         """Measure a part, and write it down if it did something; the caller may add facts."""
-        row: Row = {"what": what, "part": part}
+        row: JsonObject = {"what": what, "part": part}
         began_s = time.monotonic()
         yield row
         row["seconds"] = round(time.monotonic() - began_s, 2)
@@ -279,6 +297,6 @@ class _Clock:
             with named_errors(self._path):
                 append_line(self._path, row)
 
-    def all(self) -> list[Row]:
+    def all(self) -> list[JsonObject]:
         """All parts of all runs, oldest first."""
         return read_lines(self._path)

@@ -15,10 +15,11 @@ from typing import Any
 
 from curation_ros.batch.workers import WorkerDiedError, check_workers, in_flight, spread
 from curation_ros.core.errors import ConfigError, CurationError
+from curation_ros.core.types import JsonObject
 from curation_ros.files import append_line, named_errors, read_lines, try_lock
 from curation_ros.study.plan import StudyPlan
 from curation_ros.study.unit_work import roll_units, train_units
-from curation_ros.study.units import PolicyUnit, Progress, RolloutUnit, Row, Unit, start_name
+from curation_ros.study.units import PolicyUnit, Progress, RolloutUnit, Unit, start_name
 from sim_node.settings import MAX_STEPS
 
 #: Runs that try a unit before it stays failed.
@@ -39,9 +40,9 @@ class Work:
         missing: what was not begun, and why; one line per unit.
     """
 
-    done: tuple[Row, ...]
+    done: tuple[JsonObject, ...]
     known: int
-    failed: tuple[Row, ...]
+    failed: tuple[JsonObject, ...]
     missing: tuple[str, ...]
 
 
@@ -105,7 +106,7 @@ class PolicyTrials:
         if not declared or declared[-1]["budget_steps"] != budget_steps:
             self._append({"kind": "declaration", **limits})
 
-    def rows(self, kind: str) -> list[Row]:
+    def rows(self, kind: str) -> list[JsonObject]:
         """Lines of the log, `policy` or `rollout`, oldest first; failed attempts included."""
         return [row for row in read_lines(self._log) if row.get("kind") == kind]
 
@@ -171,7 +172,7 @@ class PolicyTrials:
                 if unit.policy not in trained and unit.key not in past.done
             ]
             todo = [unit for unit in past.todo(units) if unit.policy in trained]
-            used, rows = self.used_steps, list[Row]()
+            used, rows = self.used_steps, list[JsonObject]()
             # Each pass begins as many units as the budget allows in the worst case, and the next
             # pass takes what they have left of it.
             while todo and (n := (self.budget_steps - used) // self.max_steps) > 0:
@@ -199,16 +200,16 @@ class PolicyTrials:
 
     def _run(
         self,
-        function: Callable[..., list[Row]],
+        function: Callable[..., list[JsonObject]],
         tasks: Sequence[Sequence[Unit]],
-        settings: Row,
+        settings: JsonObject,
         progress: Progress | None,
-    ) -> list[Row]:
+    ) -> list[JsonObject]:
         """Do tasks of several units each, and log each row; units of a dead worker have failed."""
         waiting: dict[int, Sequence[Unit]] = dict(enumerate(tasks))
-        logged: list[Row] = []
+        logged: list[JsonObject] = []
 
-        def finish(k: int, rows: Iterable[Row]) -> None:
+        def finish(k: int, rows: Iterable[JsonObject]) -> None:
             del waiting[k]
             for row in rows:
                 self._append(row)
@@ -218,7 +219,7 @@ class PolicyTrials:
 
         def done(
             chosen: Iterable[tuple[int, Sequence[Unit]]], jobs: int
-        ) -> Iterator[tuple[int, list[Row]]]:
+        ) -> Iterator[tuple[int, list[JsonObject]]]:
             return spread(
                 _numbered,
                 [(function, k, self.folder, units, settings) for k, units in chosen],
@@ -237,7 +238,7 @@ class PolicyTrials:
                 # alone to find out which; with two workers, so that it is not in this process.
                 n = in_flight(self._n_workers, self._backend, ray_ahead=1)
                 for k, units in list(waiting.items())[:n]:
-                    found: list[Row] = []
+                    found: list[JsonObject] = []
                     for unit in units:
                         try:
                             found += [row for _, rows in done([(k, [unit])], 2) for row in rows]
@@ -248,7 +249,7 @@ class PolicyTrials:
 
     # --- the log ----------------------------------------------------------------------------
 
-    def _append(self, row: Row) -> None:
+    def _append(self, row: JsonObject) -> None:
         with named_errors(self._log):
             append_line(self._log, row)
 
@@ -266,9 +267,9 @@ class PolicyTrials:
 class _Past:
     """Units of one kind as the log has them."""
 
-    def __init__(self, rows: Iterable[Row], key: Callable[[Row], Any]) -> None:
+    def __init__(self, rows: Iterable[JsonObject], key: Callable[[JsonObject], Any]) -> None:
         self._key = key
-        self.last: dict[Any, Row] = {}
+        self.last: dict[Any, JsonObject] = {}
         self._failures: dict[Any, int] = {}
         for row in rows:
             self.last[key(row)] = row
@@ -283,7 +284,9 @@ class _Past:
             if unit.key not in self.done and self._failures.get(unit.key, 0) < ATTEMPTS
         ]
 
-    def work(self, units: Sequence[Unit], rows: Sequence[Row], missing: Iterable[str]) -> Work:
+    def work(
+        self, units: Sequence[Unit], rows: Sequence[JsonObject], missing: Iterable[str]
+    ) -> Work:
         """The report, with the rows of this run."""
         last = {**self.last, **{self._key(row): row for row in rows}}
         found = (last.get(unit.key) for unit in units)
@@ -296,12 +299,16 @@ class _Past:
 
 
 def _numbered(
-    function: Callable[..., list[Row]], k: int, folder: Path, units: Sequence[Unit], settings: Row
-) -> tuple[int, list[Row]]:
+    function: Callable[..., list[JsonObject]],
+    k: int,
+    folder: Path,
+    units: Sequence[Unit],
+    settings: JsonObject,
+) -> tuple[int, list[JsonObject]]:
     return k, function(folder, units, **settings)
 
 
-def _died(unit: PolicyUnit | RolloutUnit, settings: Row) -> Row:
+def _died(unit: PolicyUnit | RolloutUnit, settings: JsonObject) -> JsonObject:
     if isinstance(unit, PolicyUnit):
         return unit.row(status="failed", reason=_DIED)
     ended = {"success": False, "steps": settings["max_steps"], "stage": "", "ended": ""}

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError, PolicyError
+from curation_ros.core.types import JsonObject
 from curation_ros.dataset.episodes import read_episode
-from curation_ros.study.units import PolicyUnit, RolloutUnit, Row, named_variant, start_name
+from curation_ros.study.units import PolicyUnit, RolloutUnit, named_variant, start_name
 from policy_node.mlp import MlpPolicy
 from policy_node.policy import load_policy
 from policy_node.rollouts import Rollout, rollout
@@ -42,7 +43,7 @@ def roll_policy(policy: Path, start: str, max_steps: int | None) -> Rollout:
 
 def roll_units(
     study: Path, units: Sequence[RolloutUnit], max_steps: int, gives_up: bool
-) -> list[Row]:
+) -> list[JsonObject]:
     """Roll out policies of a study.
 
     Args:
@@ -76,7 +77,7 @@ def roll_units(
     return rows
 
 
-def train_units(study: Path, units: Sequence[PolicyUnit]) -> list[Row]:
+def train_units(study: Path, units: Sequence[PolicyUnit]) -> list[JsonObject]:
     """Train policies of one variant and equal settings in one computation, and save them.
 
     Args:
@@ -94,7 +95,7 @@ def train_units(study: Path, units: Sequence[PolicyUnit]) -> list[Row]:
         settings = TrainingSettings(steps=units[0].steps, start_jitter_m=units[0].start_jitter_m)
     except (ConfigError, PolicyError) as err:  # all of them share it
         return [unit.row(status="failed", reason=str(err)) for unit in units]
-    rows: dict[str, Row] = {}
+    rows: dict[str, JsonObject] = {}
     jobs = []
     episodes: dict[Path, Episode] = {}
     for unit in units:
@@ -127,8 +128,8 @@ def train_units(study: Path, units: Sequence[PolicyUnit]) -> list[Row]:
     return [rows[unit.key] for unit in units]
 
 
-def _adopted(study: Path, unit: PolicyUnit) -> Row | None:
-    """Row of a policy that was saved, but not logged before its run was killed."""
+def _adopted(study: Path, unit: PolicyUnit) -> JsonObject | None:
+    """JsonObject of a policy that was saved, but not logged before its run was killed."""
     with suppress(PolicyError):
         card = MlpPolicy.load(policy_folder(study, unit.key)).card
         trained_on = sorted((str(e["id"]), tuple(e["span"] or ())) for e in card.episodes)

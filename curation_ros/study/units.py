@@ -12,14 +12,13 @@ from typing import Any, TypeVar
 
 from curation_ros.configuration import share_file
 from curation_ros.core.errors import ConfigError
-from curation_ros.core.types import Span
+from curation_ros.core.types import JsonObject, Span
 from policy_node.settings import DEFAULTS
 from policy_node.variants import Variant, read_training_config
 from sim_node.tasks import start_names
 
-Row = dict[str, Any]
 #: Called with each row when it is logged.
-Progress = Callable[[Row], None]
+Progress = Callable[[JsonObject], None]
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class PolicyUnit:
         text = json.dumps([bags, self.variant, self.seed, self.steps, self.start_jitter_m])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
-    def row(self, **result: Any) -> Row:
+    def row(self, **result: Any) -> JsonObject:
         """Its line of `units.jsonl`."""
         return {
             "kind": "policy",
@@ -89,7 +88,7 @@ class RolloutUnit:
         """Policy and start: no two rollouts of a study have both."""
         return (self.policy, self.start)
 
-    def row(self, **result: Any) -> Row:
+    def row(self, **result: Any) -> JsonObject:
         """Its line of `units.jsonl`."""
         return {"kind": "rollout", "policy": self.policy, "start": self.start, **result}
 
