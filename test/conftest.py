@@ -1,4 +1,4 @@
-"""Fixtures of every test that runs nodes: a graph of its own, and nothing left behind."""
+"""Fixtures of tests that run nodes: a graph per module, and no process left behind."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ _MARK = "CURATION_ROS_TEST"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests of the graph come last: DDS leaves threads behind, and who then forks may hang."""
+    """Tests of the graph come last: DDS leaves threads behind, and forking then may hang."""
     items.sort(key=lambda item: item.get_closest_marker("ros") is not None)
 
 
 @pytest.fixture(scope="module")
 def graph(tmp_path_factory, no_process_left):
-    """A ROS graph on a domain of its own; its nodes end with the module."""
+    """A ROS graph on a domain of its own. Its nodes end with the module."""
     with ExitStack() as stack:
         yield from _graph(stack, tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
 def other_graph(tmp_path_factory, no_process_left):
-    """Another one, on another domain."""
+    """A second graph, on another domain."""
     with ExitStack() as stack:
         yield from _graph(stack, tmp_path_factory)
 
@@ -40,7 +40,7 @@ def _graph(stack, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def no_process_left():
-    """Every process that a test starts, and what that starts, is gone in the end."""
+    """Checks that all processes that tests have started, directly or not, have ended."""
     mark = f"{_MARK}={uuid.uuid4()}"
     os.environ.update([mark.split("=")])
     yield
@@ -54,7 +54,7 @@ def _processes(mark: bytes) -> list[str]:
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
-            # Our own environment was read by /proc before the mark was set.
+            # /proc shows the environment at the start of a process, so this process has no mark.
             if mark in (folder / "environ").read_bytes().split(b"\0"):
                 found.append((folder / "cmdline").read_bytes().replace(b"\0", b" ").decode())
         except OSError:

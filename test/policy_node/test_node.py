@@ -33,7 +33,7 @@ def answers(graph, folder):
     graph.start("policy_node", policy=folder)
     types = {t: kind for t, kind in topic_map().topics.items() if t not in COMMANDS}
     with Robot(graph, types=types) as robot:
-        robot.until_heard(heard=["eef_pose", "phase", BOWL, PLATE])
+        robot.until_found(topics=["eef_pose", "phase", BOWL, PLATE])
         yield Answers(graph, robot, heard)
     graph.stop("policy_node")
 

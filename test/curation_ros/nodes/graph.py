@@ -1,4 +1,4 @@
-"""A ROS graph of a test's own: node processes, and a probe in this process that listens."""
+"""A ROS graph for one test module: node processes, and a probe in this process."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ try:
 except ImportError as err:
     pytest.skip(f"rclpy is not installed: {err}", allow_module_level=True)
 
-#: For tests: they import from here what needs ROS, so that they are skipped without it.
+#: Tests import ROS classes from here, so that they are skipped without ROS.
 __all__ = [
     "DECISIONS",
     "LATCHED",
@@ -55,21 +55,21 @@ __all__ = [
     "jsonl",
 ]
 
-#: Patience for anything that takes part of a second on an idle machine.
+#: How long to wait for anything that takes a fraction of a second on an idle machine.
 PATIENCE_S = 60.0
 _TAIL = 12
 
 
 class Graph:
-    """Nodes on a domain of their own, and what was said on their topics since the start.
+    """Nodes on a domain of their own, and all messages on their topics since the start.
 
     Attributes:
         folder: for datasets and files of the test.
-        events: of topic `episode`.
-        outcomes: of topic `episode/outcome`.
-        recorders: of topic `recorder/status`.
-        decisions: of topic `curator/decision`.
-        health: of /diagnostics.
+        events: messages on `episode`.
+        outcomes: messages on `episode/outcome`.
+        recorders: messages on `recorder/status`.
+        decisions: messages on `curator/decision`.
+        health: messages on /diagnostics.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -112,7 +112,7 @@ class Graph:
         self.domain.close()
 
     def listen(self, namespace: str) -> None:
-        """Listen to the episodes and decisions of a namespace, too."""
+        """Subscribe to the episodes and decisions of a namespace, too."""
         for topic, qos, sink in (
             ("episode", LATCHED, self._on_event),
             ("episode/outcome", LATCHED, self.outcomes.append),
@@ -127,7 +127,7 @@ class Graph:
             )
 
     def _on_event(self, status: Status) -> None:
-        with suppress(EpisodeError):  # a test may say nonsense
+        with suppress(EpisodeError):  # a test may publish a spoilt event
             self.events.append(event_from_status(status))
 
     # --- nodes ------------------------------------------------------------------------------
@@ -148,21 +148,21 @@ class Graph:
             self.nodes.stop(key)
 
     def pause(self, key: str) -> None:
-        """Make a node hang that was started in `pausing.pausable`, and see that it does."""
+        """Pause a node that was started in `pausing.pausable`, and wait until it stands still."""
         self.nodes.send(key, PAUSE)
-        self.until(lambda: stands_still(self.nodes.pid(key)), f"{key} hangs")
+        self.until(lambda: stands_still(self.nodes.pid(key)), f"{key} stands still")
 
     def resume(self, key: str) -> None:
-        """Let a node go on."""
+        """Let a paused node continue."""
         self.nodes.send(key, RESUME)
 
     def log(self, key: str) -> str:
-        """What a node has printed."""
+        """The output of a node so far."""
         path = self.folder / "logs" / f"{key}.log"
         return path.read_text(errors="replace") if path.exists() else ""
 
     def expect_exit(self, key: str, timeout_s: float = PATIENCE_S) -> tuple[int, str]:
-        """Wait for a node to end by itself; returns its exit code and its output."""
+        """Wait for a node to end by itself. Returns its exit code and its output."""
         self.until(lambda: self.nodes.ended(key) is not None, f"{key} ends", timeout_s)
         code = self.nodes.ended(key)
         self.stop(key)
@@ -172,11 +172,11 @@ class Graph:
     # --- waiting ----------------------------------------------------------------------------
 
     def spin(self, seconds: float = 0.02) -> None:
-        """Listen until something was heard, at most that long."""
+        """Receive at most one message, and wait for it at most that long."""
         self._executor.spin_once(timeout_sec=seconds)
 
     def until(self, condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
-        """Listen until a condition holds; returns what it returned."""
+        """Receive messages until a condition holds. Returns what the condition returned."""
         deadline_s = time.monotonic() + timeout_s
         while not (found := condition()):
             if time.monotonic() > deadline_s:
@@ -185,7 +185,7 @@ class Graph:
         return found
 
     def quiet(self, seconds: float) -> None:
-        """Listen for a while: for what must not happen."""
+        """Receive messages for a while, to see that something does not happen."""
         deadline_s = time.monotonic() + seconds
         while time.monotonic() < deadline_s:
             self.spin()
@@ -197,7 +197,7 @@ class Graph:
         )
 
     def ready(self, *keys: str, line: str = "domain ") -> None:
-        """Wait until nodes have said in their logs that they are up."""
+        """Wait until a line in their logs says that nodes are up."""
         for key in keys:
 
             def is_up(key: str = key) -> bool:
@@ -207,7 +207,7 @@ class Graph:
             self.until(is_up, f"{key} logs {line!r}")
 
     def recorded(self, episode_id: str) -> Status:
-        """Wait until a recorder has closed an episode, or failed to."""
+        """Wait until a recorder has closed the bag of an episode, or has failed."""
         return self.until(
             lambda: next(
                 (
@@ -235,7 +235,7 @@ class Graph:
         )
 
     def settled(self, dataset: Path, episode_id: str) -> Decision:
-        """Wait until the curator has compared an episode with its bag; the last decision on it."""
+        """Wait until the curator has compared an episode with its bag; its last decision."""
 
         def compared() -> Decision | None:
             known = Dataset(dataset).decisions(episode_id)
@@ -244,36 +244,36 @@ class Graph:
         return self.until(compared, f"decision on {episode_id} compared with its bag")
 
     def client(self, kind: Any, service: str) -> Any:
-        """A client of a service that is there, the same one each time: the server knows it."""
+        """A client of a service that is there. It is kept, because the server has found it."""
         if service not in self._clients:
             self._clients[service] = self.node.create_client(kind, service)
         self.until(self._clients[service].service_is_ready, f"service {service}")
         return self._clients[service]
 
     def call(self, kind: Any, service: str, request: Any) -> Any:
-        """Call a service; returns its response."""
+        """Call a service. Returns its response."""
         future = self.client(kind, service).call_async(request)
         self.until(future.done, f"answer of {service}")
         return future.result()
 
     def counts_publishers(self, node: str, topics: Sequence[str], n: int) -> None:
-        """Wait until a node reports that it sees so many publishers of each topic."""
+        """Wait until a node reports that it has found n publishers of each topic."""
         since = len(self.health)
         wanted = {f"publishers/{topic}": str(n) for topic in topics}
         self.until(
             lambda: any(
                 s.name == node and wanted.items() <= s.values.items() for s in self.health[since:]
             ),
-            f"{node} sees {n} publishers of {' and '.join(topics)}",
+            f"{node} has found {n} publishers of {' and '.join(topics)}",
         )
 
     def problem(self, node: str, text: str) -> Status:
-        """Wait for a complaint of a node on /diagnostics."""
+        """Wait until a node reports a problem on /diagnostics."""
         return self.until(
             lambda: next(
                 (s for s in self.health if s.name == node and s.level and text in s.message), None
             ),
-            f"{node} complains of {text!r} on /diagnostics",
+            f"{node} reports {text!r} on /diagnostics",
         )
 
 

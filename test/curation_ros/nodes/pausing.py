@@ -1,9 +1,9 @@
-"""Nodes that hang for a while, as one does that computes or waits for a disk.
+"""Pauses nodes for a while, as a long computation or a slow disk would.
 
-The whole process must not be stopped for that (SIGSTOP) while others publish to it through shared
-memory: about once in fifty it is stopped while it holds a lock there. Who publishes to it is then
-held up for a second and gives that memory up, and the process may hear nothing when it goes on.
-With discovery on this machine alone, rmw_fastrtps has no other transport.
+SIGSTOP is no way to do that while others publish to the process through shared memory. In about
+one of fifty trials it stops the process while that holds a lock there. Its publishers then block
+for a second and give up that memory, and the process may receive nothing after it continues. With
+discovery on this machine alone, rmw_fastrtps has no other transport.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from pathlib import Path
 
 import pytest
 
-#: Sent to a process started in `pausable`. Its Python stops within some 20 ms, and goes on; the
-#: threads of its transport take messages all the time, until its queues are full.
+#: Signals for a process that was started in `pausable`. Its Python stops within 20 ms, and
+#: continues. The threads of its transport take messages all the time, until its queues are full.
 PAUSE, RESUME = signal.SIGUSR1, signal.SIGUSR2
-#: A node that spins wakes up several times in that.
+#: A node that spins wakes up several times in this period.
 _STILL_S = 0.1
 
 
 def stands_still(pid: int) -> bool:
-    """Whether the main thread of a node, which wakes up every 20 ms, does so no more."""
+    """Whether the main thread of a node, which otherwise wakes up every 20 ms, is still."""
     before = _switches(pid)
     time.sleep(_STILL_S)
     return _switches(pid) == before

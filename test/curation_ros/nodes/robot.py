@@ -1,6 +1,6 @@
 """A synthetic robot: publishes episodes of any topic map with real messages, and spoils them.
 
-An episode is made first, as plain data (`Take`); what goes wrong is a function from take to take.
+An episode is made first, as plain data (`Take`). A fault is a function from take to take.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _next_start_ns = time.time_ns()
 
 @dataclass(frozen=True)
 class Take:
-    """One episode as a robot publishes it: what its owner says, and the messages in order."""
+    """One episode as a robot publishes it: its start, its end, and the messages in order."""
 
     started: EpisodeEvent
     ended: EpisodeEvent
@@ -76,7 +76,7 @@ class Take:
         return [m for t, m in self.messages if t == topic]
 
     def until(self, share: float) -> int:
-        """Index of the message with which a share of the episode is over."""
+        """Index of the message at which that share of the episode is over."""
         return int(share * len(self.messages))
 
 
@@ -89,7 +89,7 @@ def plain(value: Any) -> Any:
     if hasattr(value, "get_fields_and_field_types"):
         names = list(value.get_fields_and_field_types())
     elif hasattr(value, "__dataclass_fields__"):
-        # Without its type's constants, which are in capitals.
+        # Without the constants of its type, which are in capitals.
         names = [n for n in value.__dataclass_fields__ if n != "__msgtype__" and not n.isupper()]
     elif hasattr(value, "__slots__") and not isinstance(value, (bytes, str, np.generic)):
         names = [n for n in value.__slots__ if not n.startswith("_")]
@@ -108,7 +108,7 @@ def plain(value: Any) -> Any:
 
 
 def new_start_ns(length_s: float = 60.0) -> int:
-    """Start of an episode after all those before it, near the wall's time."""
+    """Start of an episode: after all earlier episodes, and close to the current time."""
     global _next_start_ns
     start = max(_next_start_ns, time.time_ns())
     _next_start_ns = start + int(length_s * NS_PER_S)
@@ -123,7 +123,7 @@ def make_take(
     end_ns: int | None = None,
     counts: bool = True,
 ) -> Take:
-    """A take of these messages; its owner counts them, or it ends and they go on."""
+    """A take of these messages. Its owner counts them, or it ends while they continue."""
     number = next(_numbers)
     stamps: dict[str, set[int]] = {}
     for topic, message in messages:
@@ -146,7 +146,7 @@ def libero_take(
     name: str = "",
     counts: bool = True,
 ) -> Take:
-    """A pick and place of the LIBERO robot; `open_at` in mid-way is an early release."""
+    """A pick and place of the LIBERO robot. `open_at` in the middle is an early release."""
     start = new_start_ns(n_steps / RATE_HZ + 30.0)
     episode = make_episode(
         np.random.default_rng(seed),
@@ -184,10 +184,10 @@ def libero_messages(episode: Episode) -> list[Sent]:
 def other_robot_messages(
     rng: np.random.Generator, start_ns: int, arm: Sequence[str], *, open_at: int | None = None
 ) -> list[Sent]:
-    """A robot of test_any_robot: joints in an order of this episode's own, a continuous jaw.
+    """The robot of test_any_robot: joints in a new order per episode, a continuous jaw.
 
-    Its topics run at rates and phases of their own, so that nothing but the map joins them. It
-    goes on for three steps after the last that belongs to the episode.
+    Each topic has a rate and a phase of its own, so only the map joins them. The messages continue
+    for three steps after the end of the episode.
     """
     order = list(rng.permutation([*arm, "jaw"]))
     out: list[tuple[int, Sent]] = []
@@ -219,13 +219,13 @@ def other_robot_messages(
 
 
 def without(take: Take, topic: str, first: int = 0, last: int | None = None) -> Take:
-    """Messages [first, last) of a topic are not sent; the owner has counted them."""
+    """Messages [first, last) of a topic are not sent, although the owner has counted them."""
     gone = {id(m) for m in take.of(topic)[first:last]}
     return replace(take, messages=tuple(s for s in take.messages if id(s[1]) not in gone))
 
 
 def repeated(take: Take, every: int = 3) -> Take:
-    """Every so many steps, all messages of the step are sent again, as sim_node does."""
+    """All messages of every third step are sent again, as sim_node does."""
     out: list[Sent] = []
     for k, (_, step) in enumerate(itertools.groupby(take.messages, lambda s: stamp_ns(s[1]))):
         messages = list(step)
@@ -234,7 +234,7 @@ def repeated(take: Take, every: int = 3) -> Take:
 
 
 def interleaved(take: Take, rng: np.random.Generator, reach: int = 8) -> Take:
-    """Topics overtake each other by up to `reach` messages; each keeps its own order."""
+    """Topics overtake each other by up to `reach` messages. Each keeps its own order."""
     keys = np.arange(len(take.messages)) + reach * rng.random(len(take.messages))
     last: dict[str, float] = {}
     for k, (topic, _) in enumerate(take.messages):
@@ -244,14 +244,14 @@ def interleaved(take: Take, rng: np.random.Generator, reach: int = 8) -> Take:
 
 
 def disordered(take: Take, topic: str, at: int) -> Take:
-    """Two neighbours of a topic change places."""
+    """Two consecutive messages of a topic change places."""
     first, second = take.of(topic)[at : at + 2]
     swap = {id(first): second, id(second): first}
     return replace(take, messages=tuple((t, swap.get(id(m), m)) for t, m in take.messages))
 
 
 def jumped_back(take: Take, at: float, by_ns: int) -> Take:
-    """From a share of the episode on, every stamp is that much lower."""
+    """From that share of the episode on, every stamp is lower by `by_ns`."""
     limit = take.started.start_ns + int(at * (take.ended.end_ns - take.started.start_ns))
     back = changed(take, lambda _, ns: ns > limit, lambda m: _restamp(m, stamp_ns(m) - by_ns))
     return replace(
@@ -295,7 +295,7 @@ def _restamp(message: Any, ns: int) -> None:
 
 
 class Robot:
-    """A node with a publisher a topic; it owns `episode`, unless told not to."""
+    """A node with one publisher per topic. It owns `episode`, unless told not to."""
 
     def __init__(
         self,
@@ -312,12 +312,12 @@ class Robot:
 
         Args:
             graph: the graph.
-            map_: whose topics are published; None: the LIBERO robot's.
-            types: topic -> type, where not those of the map.
-            name: of the node.
-            namespace: of the node.
+            map_: its topics are published; None: those of the LIBERO robot.
+            types: topic -> type, to replace the types of the map.
+            name: name of the node.
+            namespace: namespace of the node.
             owner: whether it owns the episodes.
-            qos: of topics, where not that of the contract.
+            qos: topic -> QoS, to replace the QoS of mapped topics.
         """
         import rclpy
 
@@ -343,13 +343,13 @@ class Robot:
     def __exit__(self, *_: object) -> None:
         self.node.destroy_node()
 
-    def until_heard(self, n: int = 1, *, heard: Sequence[str] | None = None) -> None:
-        """Wait until so many nodes subscribe to every topic and `episode`, and have found us, too.
+    def until_found(self, n: int = 1, *, topics: Sequence[str] | None = None) -> None:
+        """Wait until n nodes subscribe to these topics, or all, and have found the publishers.
 
-        That we see a subscriber does not say that it has found our publisher.
+        Discovery is one-sided: a subscriber that is found may not yet have found the publisher.
         """
         for topic, publisher in self.publishers.items():
-            if heard is None or topic in heard:
+            if topics is None or topic in topics:
                 self._graph.until(
                     lambda p=publisher: p.get_subscription_count() >= n,
                     f"{n} subscribers on {topic}",
@@ -359,25 +359,25 @@ class Robot:
                 lambda: self._episode.get_subscription_count() >= n + 1,
                 f"{n} subscribers on episode",
             )
-        self._graph.quiet(0.1)  # what waits here may be of a node that has ended
+        self._graph.quiet(0.1)  # reports that wait here may come from a node that has ended
         since = len(self._graph.health)
-        self._graph.until(lambda: self._is_found(n, since, heard), f"{n} nodes have found {self}")
+        self._graph.until(lambda: self._is_found(n, since, topics), f"{n} nodes have found {self}")
 
-    def _is_found(self, n: int, since: int, heard: Sequence[str] | None) -> bool:
-        """Whether the newest reports of n nodes count all publishers of our topics.
+    def _is_found(self, n: int, since: int, topics: Sequence[str] | None) -> bool:
+        """Whether the newest reports of n nodes count all publishers of these topics.
 
-        Nodes may have one name: as many reports as two rounds of them give count, too.
+        Nodes may share a name. Then as many reports as two rounds of them suffice.
         """
-        publishers = [p for t, p in self.publishers.items() if heard is None or t in heard]
-        topics = [p.topic_name for p in (*publishers, self._episode) if p is not None]
+        publishers = [p for t, p in self.publishers.items() if topics is None or t in topics]
+        names = [p.topic_name for p in (*publishers, self._episode) if p is not None]
         count = self.node.count_publishers
-        wanted = {f"publishers/{topic.lstrip('/')}": str(count(topic)) for topic in topics}
+        wanted = {f"publishers/{name.lstrip('/')}": str(count(name)) for name in names}
         found: list[str] = []
         for status in reversed(self._graph.health[since:]):
-            seen = {key: status.values[key] for key in wanted if key in status.values}
-            if any(seen[key] != wanted[key] for key in seen):
+            counted = {key: status.values[key] for key in wanted if key in status.values}
+            if any(counted[key] != wanted[key] for key in counted):
                 break
-            if seen:
+            if counted:
                 found.append(status.name)
         return len(set(found)) >= n or len(found) >= 2 * n
 
@@ -387,9 +387,9 @@ class Robot:
         self._episode.publish(array_to_ros([event_to_status(event)], time.time_ns()))
 
     def send(self, messages: Iterable[Sent], *, rate_hz: float = MOST_STEPS_HZ) -> None:
-        """Publish messages, so many stamps a second.
+        """Publish messages, at this number of stamps per second.
 
-        Nobody waits for acknowledgements: Fast DDS asks for them every 3 s.
+        It does not wait for acknowledgements: Fast DDS asks for them every 3 s.
         """
         began_s, steps, last_ns = time.monotonic(), -1, None
         for topic, message in messages:
@@ -400,7 +400,7 @@ class Robot:
             self.publishers[topic].publish(message)
 
     def play(self, take: Take, *, rate_hz: float = MOST_STEPS_HZ) -> Take:
-        """Publish a whole episode, far faster than it would run."""
+        """Publish a whole episode, much faster than real time."""
         self.tell(take.started)
         self.send(take.messages, rate_hz=rate_hz)
         self.tell(take.ended)
@@ -408,5 +408,5 @@ class Robot:
 
 
 def distinct(messages: Iterable[Sent]) -> dict[str, int]:
-    """Distinct stamps by topic."""
+    """Topic -> number of distinct stamps."""
     return dict(Counter(topic for topic, _ in {(t, stamp_ns(m)) for t, m in messages}))

@@ -1,4 +1,4 @@
-"""curator/alert over DDS: told while the episode runs, and the decision says the same."""
+"""curator/alert over DDS: published during the episode, and confirmed by the decision."""
 
 from __future__ import annotations
 
@@ -32,23 +32,25 @@ def no_object(take):
 @pytest.mark.parametrize(
     ("objects", "found_by"), [(True, "object-lost"), (False, "grip-lost")], ids=str
 )
-def test_a_loss_is_told_with_its_phase_and_time(graph, objects, found_by):
+def test_loss_is_published_with_phase_and_time(graph, objects, found_by):
     dataset = graph.folder / f"dataset-{found_by}"
     map_ = topic_map() if objects else NO_OBJECT
     path = graph.folder / f"{found_by}.yaml"
     path.write_text(yaml.safe_dump(map_.to_json()))
     alerts: list[tuple[int, Status]] = []
 
-    def hear(message: DiagnosticArray) -> None:
+    def receive(message: DiagnosticArray) -> None:
         stamp = message.header.stamp
         alerts.append((stamp.sec * 10**9 + stamp.nanosec, single_from_ros(message)))
 
-    heard = graph.node.create_subscription(DiagnosticArray, "curator/alert", hear, EVENTS)
+    subscription = graph.node.create_subscription(
+        DiagnosticArray, "curator/alert", receive, EVENTS
+    )
     graph.start("curator", found_by, dataset=dataset, topic_map=path)
     graph.ready(found_by)
     graph.until(lambda: graph.node.count_publishers("curator/alert"), "the curator can alert")
     with Robot(graph, map_, name=f"robot_{len(found_by)}") as robot:
-        robot.until_heard(1)
+        robot.until_found(1)
         clean, early = libero_take(1), libero_take(2, open_at=70)
         if not objects:
             clean, early = no_object(clean), no_object(early)
@@ -68,5 +70,5 @@ def test_a_loss_is_told_with_its_phase_and_time(graph, objects, found_by):
     [found] = [f for f in decision.findings if f.id == found_by]
     assert (found.message, found.span) == (status.values["reason"], span)
     assert found_by in graph.log(found_by)
-    graph.node.destroy_subscription(heard)
+    graph.node.destroy_subscription(subscription)
     graph.stop(found_by)

@@ -1,7 +1,7 @@
-"""A robot whose topics run at 30, 100 and 250 Hz, with jitter, losses, late and late-coming data.
+"""A robot whose topics run at 30, 100 and 250 Hz, with jitter, losses and late messages.
 
-It has no phases, and one of its topics has no header. It runs in real time: what has no header is
-stamped by the middleware when it is sent.
+It has no phases, and one of its topics has no header. It runs in real time, because the middleware
+stamps messages without a header when they are sent.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ TOOL, JOINTS, WIDTH = "tool/pose", "joints", "hand/width"
 SERVO, HAND = "servo/command", "hand/command"
 RATES_HZ = {TOOL: 100.0, JOINTS: 250.0, WIDTH: 30.0, SERVO: 100.0, HAND: 30.0}
 EPISODE_S, AFTER_S, CLOSE_S, OPEN_S = 2.5, 0.3, 0.7, 2.2
-#: Of a period: how far stamps are off their grid. And of messages: how many come late.
+#: Distance of stamps from their grid, in periods; share of late messages, and how late, in s.
 JITTER, LATE_SHARE, LATE_S = 0.35, 0.1, 0.03
-#: Longer than a busy machine keeps the robot from sending; one that does for longer than the
-#: other plays again, so many takes in all, of which the last counts.
+#: No gap that a busy machine causes is as long as the first. If it delays a message by more than
+#: the second, the episode is played again, up to that many takes.
 MAX_GAP_S, MOST_LATE_S, MOST_TAKES = 1.0, 0.15, 4
-#: The curator's patience with what is withheld, and what the middleware needs to send again.
+#: How long the curator waits for withheld messages, and how long DDS needs to send again.
 SHORT_S, LONG_S = 0.5, 20.0
 MAP = {
     "max_gap_s": MAX_GAP_S,
@@ -106,7 +106,7 @@ FIELD_OF = {spec["topic"]: name for name, spec in MAP["fields"].items()}
 
 @dataclass(frozen=True)
 class Sending:
-    """A message: nanoseconds from the start of the episode to its stamp, and until it is sent."""
+    """A message, its stamp, and when it is sent, in ns from the start of the episode."""
 
     topic: str
     offset_ns: int
@@ -116,7 +116,7 @@ class Sending:
 
 @dataclass
 class Performance:
-    """What one episode is to send, and what its owner says of it."""
+    """The messages of one episode, and its event."""
 
     name: str
     sendings: list[Sending]
@@ -130,14 +130,14 @@ class Performance:
         return self.event.id
 
     def rows(self, topic: str) -> list[tuple[int, tuple[float, ...]]]:
-        """Stamps and values that were sent on a topic."""
+        """Stamps and values of the messages on a topic."""
         assert self.event is not None
         sent = [s for s in (*self.sendings, *self.withheld) if s.topic == topic]
         return [(self.event.start_ns + s.offset_ns, s.values) for s in sent]
 
 
 def perform(seed: int, name: str, *, open_s: float = OPEN_S) -> Performance:
-    """A demonstration: out and back again, closing and opening on the way."""
+    """A demonstration: the tool moves out and back, and the jaw closes and opens."""
     rng = np.random.default_rng(seed)
     reach = rng.uniform(0.1, 0.3, 3)
     pace = 2.0 * np.pi / EPISODE_S
@@ -160,27 +160,27 @@ def perform(seed: int, name: str, *, open_s: float = OPEN_S) -> Performance:
             np.arange(n) + rng.uniform(0.2, 0.8) + JITTER * rng.uniform(-0.5, 0.5, n)
         ) * period_s
         late = rng.uniform(0.0005, 0.004, n) + LATE_S * (rng.random(n) < LATE_SHARE)
-        due_s = np.maximum.accumulate(at_s + late)  # one writer's messages keep their order
+        due_s = np.maximum.accumulate(at_s + late)  # messages of one writer keep their order
         sendings += [
             Sending(topic, int(a * 1e9), int(d * 1e9), values(topic, a))
             for a, d in zip(at_s, due_s, strict=True)
         ]
     sendings.sort(key=lambda s: s.due_ns)
     inside = [s for s in sendings if s.offset_ns <= EPISODE_S * 1e9]
-    # Nobody but the middleware knows the stamps of what has no header.
+    # Only the middleware knows the stamps of messages without a header.
     counts = {t: sum(s.topic == t for s in inside) for t in RATES_HZ if t != WIDTH}
     return Performance(name, sendings, counts)
 
 
 def losing(one: Performance, topic: str, share: float) -> Performance:
-    """Some messages are never sent, though the owner has counted them."""
+    """Some messages are never sent, although the owner has counted them."""
     rng = np.random.default_rng(7)
     kept = [s for s in one.sendings if s.topic != topic or rng.random() >= share]
     return replace(one, sendings=kept)
 
 
 def disordered(one: Performance, topic: str) -> Performance:
-    """Two neighbours of a topic are sent in the wrong order."""
+    """Two consecutive messages of a topic are sent in the wrong order."""
     at = [k for k, s in enumerate(one.sendings) if s.topic == topic][40:42]
     first, second = (one.sendings[k] for k in at)
     swapped = list(one.sendings)
@@ -190,7 +190,7 @@ def disordered(one: Performance, topic: str) -> Performance:
 
 
 def withholding(one: Performance, topic: str, last_s: float) -> Performance:
-    """The end of a topic is kept back."""
+    """The last messages of a topic are withheld."""
     limit = (EPISODE_S - last_s) * 1e9
     back = [s for s in one.sendings if s.topic == topic and s.offset_ns > limit]
     return replace(one, sendings=[s for s in one.sendings if s not in back], withheld=back)
@@ -212,9 +212,9 @@ def to_message(one: Sending, start_ns: int) -> Any:
 def play(
     graph: Graph, robot: Robot, make: Callable[[], Performance], dataset: Path
 ) -> Performance:
-    """Run an episode in real time, anew where a busy machine kept the robot from sending.
+    """Run an episode in real time, and again if a busy machine has delayed the robot.
 
-    What has no header is stamped when it is sent: one that was sent late is another episode.
+    Messages without a header are stamped when they are sent, so a delay changes the episode.
     """
     for last in (*[False] * (MOST_TAKES - 1), True):
         one = make()
@@ -227,7 +227,7 @@ def play(
 
 
 def play_once(robot: Robot, one: Performance) -> float:
-    """Its owner says at once when it begins and ends; how late it sent what is stamped then, s."""
+    """Run an episode. Returns the largest delay of a message without a header, in s."""
     late_ns = 0
     start_ns = time.time_ns()
     started = EpisodeEvent(new_episode_id(), one.name, "started", start_ns)
@@ -249,7 +249,7 @@ def send_withheld(robot: Robot, one: Performance) -> None:
         robot.publishers[sending.topic].publish(to_message(sending, one.event.start_ns))
 
 
-#: Name -> (the episode, findings of the recording that it must have).
+#: Name -> (the episode, its expected findings of the recording).
 PERFORMANCES = {
     "good": (lambda: perform(10, "good"), set()),
     "early": (lambda: perform(11, "early", open_s=1.3), set()),
@@ -270,7 +270,7 @@ class Session:
     decided: dict[str, list[Any]]
 
     def live(self, name: str) -> list[Any]:
-        """Decisions as they stood when the episode's curator had compared it with its bag."""
+        """Decisions on an episode after its curator had compared it with its bag."""
         return self.decided[name]
 
     def bag(self, name: str) -> Any:
@@ -285,7 +285,7 @@ def session(graph):
     played, decided = {}, {}
     with Robot(graph, topic_map_from_json(MAP)) as robot:
         graph.start("recorder", "reference", dataset=reference, topic_map=map_file)
-        robot.until_heard()
+        robot.until_found()
         for k in range(3):
             one = play(graph, robot, partial(perform, k, f"reference-{k}"), reference)
             assert graph.recorded(one.id).message.startswith("closed ")
@@ -293,7 +293,7 @@ def session(graph):
         options = {"dataset": dataset, "topic_map": map_file}
         graph.start("recorder", "recorder", drain_timeout_s=LONG_S, **options)
         graph.start("curator", "curator", reference=[reference], **options)
-        robot.until_heard(2)
+        robot.until_found(2)
         for name, (make, _) in PERFORMANCES.items():
             played[name] = play(graph, robot, make, dataset)
             graph.settled(dataset, played[name].id)
@@ -302,11 +302,11 @@ def session(graph):
         graph.start(
             "curator", "impatient", reference=[reference], drain_timeout_s=SHORT_S, **options
         )
-        robot.until_heard(2)
+        robot.until_found(2)
         one = played[LATE] = play(
             graph, robot, lambda: withholding(perform(15, LATE), JOINTS, 0.4), dataset
         )
-        graph.decided(one.id)  # its gate has closed; the recorder's waits
+        graph.decided(one.id)  # its gate has closed; the gate of the recorder still waits
         send_withheld(robot, one)
         graph.settled(dataset, one.id)
         decided[LATE] = Dataset(dataset).decisions(one.id)
@@ -335,7 +335,7 @@ def test_live_equals_offline(session, offline, name):
 
 
 @pytest.mark.parametrize("name", PERFORMANCES)
-def test_bag_adds_nothing_to_what_was_seen_live(session, name):
+def test_bag_adds_nothing_to_the_live_episode(session, name):
     [*_, last] = session.live(name)
     assert (last.revision, last.evidence["bag"]) == (1, "equal")
 
@@ -354,7 +354,7 @@ def test_verdicts_follow_from_the_performances(session):
 
 
 @pytest.mark.parametrize("name", [*PERFORMANCES, LATE])
-def test_episode_is_what_was_sent_resampled_by_the_rule(session, name):
+def test_episode_is_the_sent_data_resampled_by_the_rule(session, name):
     one, bag = session.played[name], open_bag(session.bag(name))
     rows = {FIELD_OF[topic]: one.rows(topic) for topic in RATES_HZ}
     rows["width"] = [
@@ -370,7 +370,7 @@ def test_episode_is_what_was_sent_resampled_by_the_rule(session, name):
         np.testing.assert_array_equal(episode.field(field_name), fields[field_name])
     np.testing.assert_allclose(episode.field("arm"), fields["arm"], rtol=1e-9, atol=1e-12)
     assert episode.rate_hz == pytest.approx(RATES_HZ[TOOL], rel=0.1)
-    assert np.ptp(np.diff(episode.stamps_ns)) > 1_000_000  # nothing has straightened the clock
+    assert np.ptp(np.diff(episode.stamps_ns)) > 1_000_000  # the clock keeps its jitter
 
 
 def test_topic_without_a_header_has_the_stamps_of_its_sender(session):
@@ -380,7 +380,7 @@ def test_topic_without_a_header_has_the_stamps_of_its_sender(session):
     assert stamps == sorted(set(stamps))
     assert one.event is not None
     assert all(one.event.start_ns <= ns for ns in stamps)
-    # Sent in real time, so that its stamps are those of a clock that nobody wrote into it.
+    # The robot wrote no stamps: they come from the clock of the sending process.
     assert (stamps[-1] - stamps[0]) / NS_PER_S == pytest.approx(EPISODE_S, abs=1.0)
     sent = [v for _, (v,) in one.rows(WIDTH)]
     values = [struct.unpack_from("<d", m.data, 4)[0] for m in messages]
@@ -397,7 +397,7 @@ def test_data_after_the_gate_has_closed_lead_to_revision_2(session):
     assert last.verdict == "keep"
 
 
-def test_what_needs_phases_says_so(session):
+def test_scorers_without_a_score_abstain(session):
     last = session.live("good")[-1]
     for scorer, score in last.scores.items():
         assert (score is None) == (scorer in last.abstained)

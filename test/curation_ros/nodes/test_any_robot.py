@@ -1,4 +1,4 @@
-"""Another robot: other names, joints in changing order, no phases, a namespace and a remap."""
+"""Another robot: other names, joints in a changing order, no phases, a namespace, a remap."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ pytestmark = pytest.mark.ros
 
 ARM = ("shoulder", "elbow", "wrist")
 NAMESPACE = "/left_arm"
-#: Stamps a second; a step has four.
+#: Stamps per second; a step has four.
 RATE_HZ = 1600.0
-# The map says `joints`; on this robot's graph a driver calls it otherwise.
+# The map says `joints`, but the driver of this robot uses another name.
 DRIVER = "driver/joint_states"
 MAP = {
     "max_gap_s": 0.25,
@@ -80,14 +80,14 @@ def take(seed, name, *, open_at=None):
     start = new_start_ns()
     rng = np.random.default_rng(seed)
     messages = other_robot_messages(rng, start, ARM, open_at=open_at)
-    # As when driven by hand: it ends with a stamp of the clock, and the robot goes on.
+    # As with a manual episode, it ends at a stamp of the clock, and the robot continues.
     end = start + N_STEPS * PERIOD_NS
     return make_take(messages, start, name, end_ns=end, counts=False)
 
 
 @pytest.fixture(scope="module")
 def recorded(graph):
-    """A reference, two demonstrations, and where they were recorded."""
+    """Datasets of a reference and of two demonstrations, and the two."""
     map_file = graph.folder / "robot.yaml"
     map_file.write_text(yaml.safe_dump(MAP))
     reference, dataset = graph.folder / "reference", graph.folder / "dataset"
@@ -97,7 +97,7 @@ def recorded(graph):
     graph.listen(NAMESPACE + "/")
     with Robot(graph, types=types, namespace=NAMESPACE) as robot:
         graph.start("recorder", "reference", remaps, dataset=reference, topic_map=map_file)
-        robot.until_heard()
+        robot.until_found()
         for k in range(3):
             played = robot.play(take(k, f"reference-{k}"), rate_hz=RATE_HZ)
             assert graph.recorded(played.id).message.startswith("closed ")
@@ -107,7 +107,7 @@ def recorded(graph):
             "curator", "curator", remaps, dataset=dataset, topic_map=map_file,
             reference=[reference],
         )  # fmt: skip
-        robot.until_heard(2)
+        robot.until_found(2)
         takes = [take(10, "good"), take(11, "early", open_at=45)]
         for one in takes:
             robot.play(one, rate_hz=RATE_HZ)
@@ -129,7 +129,7 @@ def test_joints_are_found_by_their_names(recorded):
     orders = set()
     for one in takes:
         episode = read_episode(dataset / "episodes" / one.id)
-        # Of two a step, the last at or before the tool's.
+        # There are two per step. The episode has the last one that is not later than the tool.
         sent = one.of(DRIVER)[: 2 * len(episode) : 2]
         orders.add(tuple(sent[0].name))
         by_name = [dict(zip(m.name, m.position, strict=True)) for m in sent]
@@ -153,8 +153,8 @@ def test_live_equals_offline(recorded):
     assert [rows[one.id]["decision"] for one in takes] == ["keep", "discard"]
 
 
-def test_scorers_say_why_they_abstain(recorded, graph):
-    """Without phases and objects nothing guesses: a score, or a reason."""
+def test_scorers_abstain_with_a_reason(recorded, graph):
+    """Without phases and objects, each scorer gives a score or a reason."""
     dataset, _, takes = recorded
     decision = Dataset(dataset).decisions(takes[0].id)[-1]
     for scorer, score in decision.scores.items():

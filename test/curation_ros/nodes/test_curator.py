@@ -1,4 +1,4 @@
-"""A curator on the graph: its services, its latched decisions, a person's word, a restart."""
+"""A curator on the graph: services, latched decisions, overrides, a restart."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from curation_ros.dataset.dataset import Dataset
 
 pytestmark = pytest.mark.ros
 
-#: More than are kept.
+#: More episodes than the curator remembers.
 N_EPISODES, N_KEPT = 204, 200
 
 
@@ -32,7 +32,7 @@ def dataset(graph):
 def takes(graph, dataset):
     """Many short episodes, recorded and decided on."""
     with Robot(graph) as robot:
-        robot.until_heard(2)
+        robot.until_found(2)
         takes = []
         for k in range(N_EPISODES):
             takes.append(robot.play(libero_take(k, 3, name=f"pick-{k + 1:04d}")))
@@ -48,7 +48,7 @@ def decisions(graph):
 
 
 def override(graph, key, value):
-    graph.until(graph.override_publisher.get_subscription_count, "the curator listens")
+    graph.until(graph.override_publisher.get_subscription_count, "the curator subscribes")
     graph.override_publisher.publish(KeyValue(key=key, value=value))
 
 
@@ -60,18 +60,18 @@ def test_service_returns_the_last_decisions(graph, takes):
     values = {v.key: v.value for v in answer.status[0].values}
     assert values["verdict"] == answer.status[0].message == "review"
     assert values["reason"].startswith("too-short: 3 steps")
-    assert values["score/knn"] == ""  # it abstained: nothing to compare with
+    assert values["score/knn"] == ""  # it abstained, without a reference
     assert float(values["score/length"]) == -3.0
 
 
 def test_late_joiner_gets_the_latched_decisions(graph, takes):
-    seen = []
+    received = []
     late = graph.node.create_subscription(
-        DiagnosticArray, "curator/decision", lambda m: seen.extend(m.status), DECISIONS
+        DiagnosticArray, "curator/decision", lambda m: received.extend(m.status), DECISIONS
     )
-    graph.until(lambda: len(seen) >= N_KEPT, "the latched decisions")
+    graph.until(lambda: len(received) >= N_KEPT, "the latched decisions")
     graph.quiet(0.3)
-    assert [s.hardware_id for s in seen] == [t.id for t in takes[-N_KEPT:]]
+    assert [s.hardware_id for s in received] == [t.id for t in takes[-N_KEPT:]]
     graph.node.destroy_subscription(late)
 
 
@@ -83,7 +83,7 @@ def test_published_scores_are_those_on_disk(graph, dataset, takes):
 def test_override_by_name_and_by_the_beginning_of_an_id(graph, dataset, takes):
     override(graph, takes[3].name, "keep it looks fine")
     assert graph.decided(takes[3].id, revision=2).values["verdict"] == "keep"
-    # Of ids minted in the same millisecond the first 13 digits are equal.
+    # Ids that are minted in the same millisecond share their first 13 digits.
     override(graph, takes[4].id[:30], "discard")
     status = graph.decided(takes[4].id, revision=2)
     assert (status.level, status.message) == (2, "discard")
@@ -119,7 +119,7 @@ def test_curate_returns_the_path_of_its_manifest(graph, dataset, takes):
 
 
 def test_restarted_curator_changes_no_decision(graph, dataset, takes):
-    """It sees the latched past of owner and recorder; bags decide, and a person stays in force."""
+    """It receives latched old events. Bags decide, and overrides stay in force."""
     logs = {log.name: log.read_text() for log in (dataset / "decisions").glob("*.jsonl")}
     graph.stop("curator")
     graph.decisions.clear()

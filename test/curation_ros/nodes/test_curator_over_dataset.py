@@ -1,4 +1,4 @@
-"""A curator whose rule looks at the whole dataset: provisional on the graph, final by ~/curate."""
+"""A rule over the whole dataset: provisional during recording, final by ~/curate."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from curation_ros.dataset.dataset import Dataset
 
 pytestmark = pytest.mark.ros
 
-#: The shorter, the better; each is shorter than all before it.
+#: Shorter is better, and each episode is shorter than all before it.
 LENGTHS = (90, 80, 70, 60, 50, 40)
 CONFIG = """
 scorers: [length, gripper_timing]
@@ -37,7 +37,7 @@ def dataset(graph):
 @pytest.fixture(scope="module")
 def takes(graph, dataset):
     with Robot(graph) as robot:
-        robot.until_heard(2)
+        robot.until_found(2)
         takes = []
         for k, n_steps in enumerate(LENGTHS):
             takes.append(robot.play(libero_take(k, n_steps, name=f"pick-{k + 1}")))
@@ -46,7 +46,7 @@ def takes(graph, dataset):
         yield takes
 
 
-def test_live_decisions_are_provisional_and_name_what_they_have_seen(graph, dataset, takes):
+def test_live_decisions_are_provisional_and_count_the_episodes_so_far(graph, dataset, takes):
     first = [Dataset(dataset).decisions(t.id)[0] for t in takes]
     assert {d.evidence["basis"] for d in first} == {"provisional"}
     assert [d.evidence["fitted_on"]["episodes"] for d in first] == [1, 2, 3, 4, 5, 6]
@@ -57,7 +57,7 @@ def test_live_decisions_are_provisional_and_name_what_they_have_seen(graph, data
     assert graph.decided(takes[5].id).message == "keep"
 
 
-def test_curate_decides_finally_and_publishes_what_is_new(graph, dataset, takes):
+def test_curate_decides_finally_and_publishes_new_decisions(graph, dataset, takes):
     answer = graph.call(Trigger, "curator/curate", Trigger.Request())
     assert answer.success, answer.message
     for take, verdict in zip(takes, ["discard"] * 3 + ["keep"] * 3, strict=True):

@@ -27,7 +27,7 @@ def dataset(graph):
 
 
 def two_rounds(graph):
-    """Wait for a report of each node that has looked at the graph after this was called."""
+    """Wait for a report of each node whose check of the graph began after this call."""
     for _ in range(2):
         graph.health.clear()
         graph.until(lambda: {s.name for s in graph.health} >= set(NODES), "they report again")
@@ -41,7 +41,7 @@ def test_topic_of_the_wrong_type_is_named(graph, dataset):
         "the topic map expects geometry_msgs/msg/PoseStamped"
     )
     with Robot(graph, types=types) as robot:
-        robot.until_heard(2, heard=[t for t in types if t != PLATE])
+        robot.until_found(2, topics=[t for t in types if t != PLATE])
         for node in NODES:  # before an episode begins
             graph.problem(node, problem)
             assert graph.log(node).count(problem) == 1
@@ -54,11 +54,11 @@ def test_topic_of_the_wrong_type_is_named(graph, dataset):
 
 
 def test_missing_publisher_is_named_while_an_episode_runs(graph, dataset):
-    """No publisher at all; between episodes that is no problem."""
+    """Between episodes, a missing publisher is no problem."""
     types = {t: kind for t, kind in topic_map().topics.items() if t != PLATE}
     take = without(libero_take(2), PLATE)
     with Robot(graph, types=types) as robot:
-        robot.until_heard(2)
+        robot.until_found(2)
         two_rounds(graph)
         assert {s.message for s in graph.health} == {"ok"}
         robot.tell(take.started)
@@ -82,7 +82,7 @@ def test_two_owners_of_the_episode_are_an_error(graph, dataset):
 
 def test_spoilt_event_is_a_line_in_the_log(graph, dataset):
     with Robot(graph) as robot:
-        robot.until_heard(2)
+        robot.until_found(2)
         started = libero_take(3).started
         robot.tell(type(started)(started.id, started.name, "paused", started.start_ns))
         for node in NODES:
@@ -93,7 +93,7 @@ def test_spoilt_event_is_a_line_in_the_log(graph, dataset):
 def test_truncated_bag_is_named_and_the_others_are_played(graph, dataset):
     ids = []
     with Robot(graph) as robot:
-        robot.until_heard(2)
+        robot.until_found(2)
         for seed in (4, 5, 6):
             ids.append(robot.play(libero_take(seed)).id)
             graph.settled(dataset, ids[-1])
@@ -104,18 +104,20 @@ def test_truncated_bag_is_named_and_the_others_are_played(graph, dataset):
     torn = copy / ids[1] / f"{ids[1]}_0.mcap"
     torn.write_bytes(torn.read_bytes()[:-2000])
     graph.decisions.clear()
-    # So slowly that we, too, have discovered it before it is over.
+    # So slowly that this process discovers the replay before it is over.
     graph.start("replay", bags=[copy], rate=1.0)
-    graph.until(lambda: any(e.source == "replay" for e in graph.events), "we hear the replay")
+    graph.until(
+        lambda: any(e.source == "replay" for e in graph.events), "the replay is discovered"
+    )
     code, log = graph.expect_exit("replay")
     assert code == 0
-    # What it said last may still be on its way to us.
+    # Its last messages may still be on their way.
     graph.until(lambda: ids[2] in [s.hardware_id for s in graph.decisions], "the last decision")
     graph.until(lambda: (graph.events[-1].id, graph.events[-1].event) == (ids[2], "ended"), "end")
     assert [line for line in log.splitlines() if "[ERROR]" in line and str(torn) in line]
     assert "Traceback" not in log
     assert [s.hardware_id for s in graph.decisions] == [ids[0], ids[2]]
-    # What is replayed is judged and not recorded, and equal data are judged as before.
+    # Replayed episodes are decided on but not recorded. Equal data give equal decisions.
     assert len(list(Dataset(dataset).bags())) == 5
     for episode_id in (ids[0], ids[2]):
         assert {d.revision for d in Dataset(dataset).decisions(episode_id)} == {1}
@@ -128,12 +130,12 @@ def test_truncated_bag_is_named_and_the_others_are_played(graph, dataset):
     ]
 
 
-def test_bag_of_a_stopped_recorder_outranks_what_went_on(graph, dataset):
-    """Training reads bags: what the recorder has not seen is not in the decision either."""
+def test_bag_of_a_stopped_recorder_outranks_later_samples(graph, dataset):
+    """Training reads bags, so a decision leaves out what the recorder has missed."""
     take = libero_take(7)
     half = take.until(0.5)
     with Robot(graph) as robot:
-        robot.until_heard(2)
+        robot.until_found(2)
         robot.tell(take.started)
         robot.send(take.messages[:half])
         graph.quiet(0.3)
@@ -152,16 +154,16 @@ def test_bag_of_a_stopped_recorder_outranks_what_went_on(graph, dataset):
 
 
 def test_curator_that_is_stopped_in_mid_episode_waits_for_its_end(graph, dataset):
-    """Ctrl-C reaches everybody at once, and the owner needs a moment to say how it ended."""
+    """Ctrl-C reaches all nodes at once, and the owner needs a moment to publish the end."""
     take = libero_take(8)
     aborted = replace(take.ended, event="aborted", counts={}, reason="aborted: the robot stopped")
     with Robot(graph) as robot:
-        robot.until_heard(1)
+        robot.until_found(1)
         robot.tell(take.started)
         robot.send(take.messages[: take.until(0.5)])
         graph.until(
             lambda: [s for s in graph.health if s.name == "curator"][-1].hardware_id == take.id,
-            "the curator sees the episode",
+            "the curator has the episode",
         )
         graph.nodes.send("curator", signal.SIGINT)
         graph.quiet(0.3)  # without the wait it would have gone by now

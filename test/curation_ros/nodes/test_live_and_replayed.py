@@ -30,7 +30,7 @@ from curation_ros.dataset.dataset import Dataset
 
 pytestmark = pytest.mark.ros
 
-#: Longer than any queue: KEEP_LAST 1000 on both sides.
+#: More steps than a queue holds, which is 1000 messages on both sides.
 LONG_STEPS = 1120
 N_REFERENCES = 4
 
@@ -52,7 +52,7 @@ def unknown_phase(take: Take) -> Take:
     return changed(take, lambda topic, ns: topic == "phase" and ns > middle, rename)
 
 
-#: Name -> (take, findings that it must have).
+#: Name -> (take, its expected findings).
 TAKES = {
     "clean": (lambda: libero_take(1), set()),
     "early_release": (lambda: libero_take(2, open_at=70), {"object-lost", "opened-early"}),
@@ -75,7 +75,7 @@ STALLS = ("stall_within", "stall_over_the_end", "overflow")
 
 
 class Session:
-    """Everything that was recorded: dataset, takes by name, first revisions by name."""
+    """Everything that was recorded, and the datasets of the replay."""
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
@@ -87,7 +87,7 @@ class Session:
     def record_reference(self, robot: Robot) -> None:
         self.graph.start("recorder", key="reference", dataset=self.reference)
         self.graph.ready("reference")
-        robot.until_heard()
+        robot.until_found()
         for seed in range(N_REFERENCES):
             take = robot.play(libero_take(100 + seed, name=f"reference-{seed}"))
             assert self.graph.recorded(take.id).message.startswith("closed ")
@@ -99,7 +99,7 @@ class Session:
             self.graph.settled(self.dataset, self.takes[name].id)
 
     def record_stalls(self, robot: Robot) -> None:
-        """Pause the curator in mid-episode, and let it go on within the episode or after it."""
+        """Pause the curator during an episode, and resume it within the episode or after it."""
         for seed, name in enumerate(STALLS, 20):
             take = self.takes[name] = libero_take(seed, LONG_STEPS if name == "overflow" else 120)
             first, most = take.until(0.02), take.until(0.98)
@@ -120,10 +120,10 @@ class Session:
             self.graph.settled(self.dataset, take.id)
 
     def record_intrusion(self, robot: Robot) -> None:
-        """Another node publishes one of the topics, too."""
+        """A second node publishes one of the topics."""
         tool = topic_map().only(["eef_position"])
         with Robot(self.graph, tool, name="intruder", owner=False) as intruder:
-            intruder.until_heard(2)
+            intruder.until_found(2)
             take = self.takes["intrusion"] = robot.play(libero_take(30))
             self.graph.settled(self.dataset, take.id)
 
@@ -147,7 +147,7 @@ def session(graph, other_graph):
             with pausable():
                 place.start("curator", dataset=dataset, reference=[session.reference])
         graph.ready("recorder", "curator")
-        robot.until_heard(2)
+        robot.until_found(2)
         session.record_takes(robot)
         session.record_stalls(robot)
         session.record_intrusion(robot)
@@ -158,13 +158,13 @@ def session(graph, other_graph):
 
 @pytest.fixture(scope="module")
 def offline(session):
-    """`curation score --json --write`: rows by episode, and no new revision where it agrees."""
+    """Rows of `curation score --json --write` by episode. It writes no new revision."""
     before = {name: len(session.live(name)) for name in session.takes}
     out = io.StringIO()
     reference = ["--reference", str(session.reference)]
     with contextlib.redirect_stdout(out):
         assert curation(["score", str(session.dataset), *reference, "--json", "--write"]) == 0
-    # It logs what differs in scores, findings, verdict, reason, span or state hash.
+    # A difference in scores, findings, verdict, reason, span or state hash would be one.
     assert {name: len(session.live(name)) for name in session.takes} == before
     return {row["episode"]: row for row in jsonl(out.getvalue())}
 
@@ -177,7 +177,7 @@ def test_live_offline_and_replayed_decisions_are_equal(session, offline, name):
     assert {k: row[k] for k in shared} == {k: live[k] for k in shared}
     assert row["decision"] == live["verdict"]
     replayed = Dataset(session.replayed).decisions(live["episode"])[-1].to_json()
-    apart = ("evidence", "revision")  # who compared what with which bag
+    apart = ("evidence", "revision")  # they name the bag of the comparison
     assert {k: v for k, v in replayed.items() if k not in apart} == {
         k: v for k, v in live.items() if k not in apart
     }
@@ -202,9 +202,9 @@ def test_stall_without_loss_needs_one_revision(session):
     for name in ("clean", "repeated", "interleaved", "stall_within", "stall_over_the_end"):
         first, last = session.live(name)[0], session.live(name)[-1]
         if last.revision == 1:
-            # Alone: where even the word that it ended came late, the bag was read first.
+            # `alone` if even the end came late, so that the bag was read first.
             assert last.evidence["bag"] in ("equal", "alone"), name
-        else:  # a busy machine made the middleware send again, later than the gate waits
+        else:  # on a busy machine, DDS may send again later than the gate waits
             assert name in STALLS, name
             assert (last.revision, last.evidence["bag"]) == (2, "differs"), name
             assert "incomplete" in {f.id for f in first.findings}, name
@@ -217,11 +217,11 @@ def test_live_loss_is_mended_by_the_bag(session):
     if before:
         assert "incomplete" in {f.id for f in before[0].findings}
         assert (last.revision, last.evidence["bag"]) == (2, "differs")
-    else:  # even the end was lost for the moment: the bag was read first, and has the say
+    else:  # even the end came late, so the bag was read first and decides
         assert (last.revision, last.evidence["bag"]) == (1, "alone")
 
 
-def test_finding_that_only_the_recorder_has_travels_in_the_bag(session):
+def test_finding_of_the_recorder_travels_in_the_bag(session):
     *before, last = session.live("intrusion")
     assert not any(f.id == "unknown-loss" for d in before for f in d.findings)
     assert {f.id for f in last.findings} == {"unknown-loss"}
@@ -229,9 +229,9 @@ def test_finding_that_only_the_recorder_has_travels_in_the_bag(session):
 
 
 def test_decisions_were_quick(session):
-    """From the gate's closing to the published decision; the bound is for a crowded machine."""
+    """From the closing of the gate to the published decision, on a busy machine."""
     reports = [s for s in session.graph.health if "latency_ms_p99" in s.values]
     p50, p99 = (float(reports[-1].values[f"latency_ms_{p}"]) for p in ("p50", "p99"))
     print(f"decision latency: p50 {p50:.0f} ms, p99 {p99:.0f} ms")
-    # Of so few, the 99th percentile is the one that waited for the disk.
+    # With so few decisions, the 99th percentile is one that waited for the disk.
     assert p50 < 1000.0

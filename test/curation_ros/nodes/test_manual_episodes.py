@@ -1,4 +1,4 @@
-"""A recorder that a person drives: services, who owns `episode`, and what is in the bag."""
+"""Episodes that a person starts and stops: services, the owner of `episode`, and the bag."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STEP = 7  # messages of one step of the LIBERO robot
 
 
 class Stream:
-    """A robot that nobody owns an episode of; it goes on and on."""
+    """A robot that publishes without an end. It owns no episode."""
 
     def __init__(self, graph, robot):
         self.graph = graph
@@ -31,8 +31,8 @@ class Stream:
         self.messages = libero_take(0, 400, counts=False).messages
         self.sent = 0
 
-    def go_on(self, steps):
-        """Publish some more steps, and give everybody time to take them."""
+    def continue_for(self, steps):
+        """Publish more steps, and give all nodes time to take them."""
         chunk = self.messages[self.sent : self.sent + steps * STEP]
         self.sent += len(chunk)
         self.robot.send(chunk)
@@ -56,9 +56,9 @@ def dataset(graph):
 @pytest.fixture(scope="module")
 def stream(graph, dataset):
     with Robot(graph, owner=False) as robot:
-        robot.until_heard(2)
+        robot.until_found(2)
         stream = Stream(graph, robot)
-        stream.go_on(1)
+        stream.continue_for(1)
         yield stream
 
 
@@ -68,7 +68,7 @@ def by_hand(graph, service):
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
-    """A command joins the graph anew each time, which takes seconds on a busy machine."""
+    """Each command joins the graph again, which takes seconds on a busy machine."""
     monkeypatch.setattr("curation_ros.cli.record._PATIENCE_S", PATIENCE_S)
 
 
@@ -85,15 +85,15 @@ def test_start_without_a_clock_is_refused(graph, dataset):
 
 
 def test_episode_by_command_line(graph, dataset, stream, capsys):
-    stream.go_on(20)
+    stream.continue_for(20)
     start_ns = stream.last_ns + 1
     code, started = command_line(capsys, "start")
     assert (code, started["name"]) == (0, "pour-0001")
-    inside = stream.go_on(60)
+    inside = stream.continue_for(60)
     end_ns = stream.last_ns
     code, stopped = command_line(capsys, "stop")
     assert (code, stopped) == (0, started)
-    stream.go_on(5)
+    stream.continue_for(5)
     decision = graph.settled(dataset, started["episode"])
     assert (decision.evidence["bag"], decision.verdict) == ("equal", "review")
     assert decision.reason.startswith("object_coupling cannot tell: it ends in LIFT")
@@ -141,26 +141,26 @@ def test_start_twice_and_stop_twice_are_refused(graph, dataset, stream, capsys):
         False,
         "episode pour-0002 is running: stop it first",
     )
-    stream.go_on(10)
+    stream.continue_for(10)
     assert by_hand(graph, "stop").success
-    # The next may begin while the last one still waits for late samples.
+    # The next episode may begin while the last one still waits for late samples.
     assert json.loads(by_hand(graph, "start").message)["name"] == "pour-0003"
-    stream.go_on(10)
+    stream.continue_for(10)
     assert by_hand(graph, "stop").success
     assert not by_hand(graph, "stop").success
     code, complaint = command_line(capsys, "stop")
     assert (code, complaint) == (3, "error: recorder: no episode was started by ~/start\n")
-    stream.go_on(5)
+    stream.continue_for(5)
     for name in ("pour-0002", "pour-0003"):
         episode_id = next(e.id for e in graph.events if e.name == name)
         graph.settled(dataset, episode_id)
         assert len(read_episode(dataset / "episodes" / episode_id)) == 10
 
 
-def test_stopped_in_mid_episode_the_owner_says_so(graph, dataset, stream):
+def test_recorder_stopped_during_an_episode_publishes_its_end(graph, dataset, stream):
     started = json.loads(by_hand(graph, "start").message)
-    stream.go_on(15)
-    # The curator has everything; the recorder takes what it has not, before it goes.
+    stream.continue_for(15)
+    # The curator has all messages. The recorder takes its pending messages before it ends.
     everything = {f"count/{topic}": "15" for topic in topic_map().topics}
 
     def has_everything():
@@ -175,62 +175,62 @@ def test_stopped_in_mid_episode_the_owner_says_so(graph, dataset, stream):
         lambda: next(
             (e for e in graph.events if e.id == started["episode"] and e.event != "started"), None
         ),
-        "the owner says that the episode is over",
+        "the end of the episode",
     )
     assert (event.event, event.reason) == ("aborted", "aborted: the recorder was stopped")
     assert event.end_ns == stream.last_ns
     decision = graph.settled(dataset, started["episode"])
     assert (decision.verdict, decision.evidence["bag"]) == ("review", "equal")
-    # It was not open at its beginning, and it did not get to its end.
+    # The gripper was not open at the start, and the task was not finished.
     assert {f.id for f in decision.findings} == {"aborted", "clipped-start", "unfinished"}
     assert decision.reason.startswith("aborted: the recorder was stopped")
     assert len(read_episode(dataset / "episodes" / started["episode"])) == 15
 
 
-def test_numbers_go_on_after_a_restart(graph, dataset, stream):
+def test_numbers_continue_after_a_restart(graph, dataset, stream):
     with pausable():
         graph.start("recorder", dataset=dataset, auto=False, task="pour")
-    stream.robot.until_heard(2)
-    stream.go_on(3)
+    stream.robot.until_found(2)
+    stream.continue_for(3)
     assert json.loads(by_hand(graph, "start").message)["name"] == "pour-0005"
     assert by_hand(graph, "stop").success
 
 
 @pytest.mark.parametrize("pressed", ["start", "stop"])
-def test_what_was_sent_before_a_button_was_pressed_is_before_it(graph, dataset, stream, pressed):
-    """The recorder is behind, and finds the request together with what was sent before."""
+def test_messages_sent_before_a_request_come_before_it(graph, dataset, stream, pressed):
+    """The recorder is behind, and finds the request together with earlier messages."""
     if pressed == "stop":
         assert by_hand(graph, "start").success
     client = graph.node.create_client(Trigger, f"recorder/{pressed}")
     graph.until(client.service_is_ready, "the service")
     graph.pause("recorder")
-    stream.go_on(30)
+    stream.continue_for(30)
     button = client.call_async(Trigger.Request())
     graph.quiet(0.2)
     graph.resume("recorder")
     graph.until(button.done, "the answer")
-    told = json.loads(button.result().message)
+    answer = json.loads(button.result().message)
     graph.node.destroy_client(client)
     if pressed == "start":
         event = graph.until(
-            lambda: next((e for e in graph.events if e.id == told["episode"]), None), "its start"
+            lambda: next((e for e in graph.events if e.id == answer["episode"]), None), "its start"
         )
         assert event.start_ns == stream.last_ns + 1
         assert by_hand(graph, "stop").success
     else:
-        stream.go_on(5)
-        graph.recorded(told["episode"])
-        assert len(read_episode(dataset / "episodes" / told["episode"])) == 30
+        stream.continue_for(5)
+        graph.recorded(answer["episode"])
+        assert len(read_episode(dataset / "episodes" / answer["episode"])) == 30
 
 
-def test_no_recorder_is_one_line(graph, dataset, stream, capsys, monkeypatch):
+def test_missing_recorder_is_one_line(graph, dataset, stream, capsys, monkeypatch):
     monkeypatch.setattr("curation_ros.cli.record._PATIENCE_S", 0.3)
     code, complaint = command_line(capsys, "start", "--recorder", "nobody")
     assert code == 3
     assert complaint == "error: no nobody/start within 0.3 s: is it running?\n"
 
 
-def test_follower_refuses_to_be_driven(graph, dataset, stream):
+def test_recorder_that_follows_refuses_to_start(graph, dataset, stream):
     graph.start("recorder", "follower", {"__node": "follower"}, dataset=graph.folder / "follower")
     answer = graph.call(Trigger, "follower/start", Trigger.Request())
     assert (answer.success, answer.message) == (

@@ -1,4 +1,4 @@
-"""A node that cannot work says so in one line, and ends with code 2."""
+"""A node that cannot work ends with code 2 and one line that says why."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ FILES = {
     "unknown_key.yaml": "scorers: [length]\nrule_scorer: length\nthreshhold: 1\n",
     "a_file": "",
 }
-#: Name -> (node, parameters, what the line says); {} is the folder of the files.
+#: Name -> (node, parameters, part of the line); {} is the folder of the files.
 CASES = {
     "reference_missing": ("curator", {"reference": ["{}/nowhere"]}, "nowhere: no such path"),
     "reference_empty": ("curator", {"reference": ["{}/empty"]}, "empty has no episode in it"),
@@ -82,8 +82,8 @@ CASES = {
     "no_policy": ("policy_node", {}, "parameter 'policy' is empty"),
     "policy_missing": ("policy_node", {"policy": "{}/nowhere"}, "nowhere"),
 }
-# Importing takes longer than anything else here: each case runs in a fork of one process that has
-# imported the nodes, with arguments, main() and exit code of its own.
+# Importing takes longer than anything else here. So one process imports the nodes, and each case
+# runs in a fork of it, with its own arguments, main() and exit code.
 LAUNCHER = """
 import importlib, json, os, sys
 modules = {m: importlib.import_module(m) for m in json.loads(sys.argv[1])}
@@ -196,7 +196,7 @@ def test_misspelt_parameter_is_named(graph):
 
 # --- stopped while it starts ----------------------------------------------------------------
 
-#: A node that is sent SIGINT while it is imported, and one that is while it is made.
+#: A node that gets SIGINT while it is imported, and one that gets it while it is made.
 STOPS_ITSELF = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nsignal.pause()\n"
 IMPORTED = """
 import sys

@@ -21,7 +21,7 @@ from curation_ros.nodes.processes import Domain, Nodes
 from curation_ros.nodes.programs import NODE_MODULES
 
 PATIENCE_S = 20.0
-#: Stands in for a node: notes how it was started, and ends as its parameters say.
+#: Stands in for a node. It writes down how it was started, and ends as its parameters say.
 _STAND_IN = """
 import json, os, signal, sys, time
 raw = dict(a.split(":=", 1) for a in sys.argv[1:] if ":=" in a)
@@ -48,7 +48,7 @@ except KeyboardInterrupt:
 
 @pytest.fixture
 def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Folder where stand-ins for nodes say how they were started."""
+    """Folder where stand-ins for nodes write down how they were started."""
     (tmp_path / "stand_in.py").write_text(_STAND_IN)
     monkeypatch.setitem(NODE_MODULES, "stand_in", "stand_in")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
@@ -94,7 +94,7 @@ def test_domains_that_are_held_at_once_differ() -> None:
 
 
 def _domain_id() -> int:
-    return Domain().id  # held until the process ends
+    return Domain().id  # taken until the process ends
 
 
 def test_domain_of_another_process_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,7 +177,9 @@ def test_stubborn_node_is_made_to_end(
     assert not _is_running(json.loads((told / "one").read_text())["pid"])
 
 
-def test_node_that_fails_is_reported_with_its_last_words(told: Path, domain: Domain) -> None:
+def test_node_that_fails_is_reported_with_the_last_line_of_its_log(
+    told: Path, domain: Domain
+) -> None:
     with Nodes(domain, told / "logs") as nodes:
         nodes.start("stand_in", {"name": "one", "ends": "7"})
         with pytest.raises(CurationError, match="stand_in ended with code 7: last words"):

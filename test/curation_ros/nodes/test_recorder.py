@@ -1,4 +1,4 @@
-"""A recorder that follows `episode`: whole bags, whatever happens to it or to its topics."""
+"""A recorder that follows `episode`: complete bags, whatever happens to it."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ RATE_HZ = 60.0
 SIGNALS = {"int": signal.SIGINT, "term": signal.SIGTERM, "hup": signal.SIGHUP}
 KILLED = dict.fromkeys(("killed-0", "killed-1", "killed-2"), signal.SIGKILL)
 TOGETHER = ("first", "second")
-#: The contract: a kill costs less than this of the episode, where the recorder gets to run.
+#: A kill costs less than this of the episode, if the recorder gets to run.
 MOST_LOST_S = 0.3
-#: Messages of a third of a second: who had not flushed them would lose more than that.
+#: Messages of a third of a second. A recorder that has not flushed them loses more than that.
 LAST = 140
 
 
 class Sessions:
-    """Nine recorders on one graph, and one episode that goes differently for each."""
+    """Eight recorders on one graph, and one episode that each of them sees differently."""
 
     def __init__(self, graph):
         self.graph = graph
@@ -61,16 +61,16 @@ class Sessions:
         keys = (*TOGETHER, *SIGNALS, *KILLED)
         for key in keys:
             self.graph.start("recorder", key, dataset=self.dataset(key))
-        robot.until_heard(len(keys))
+        robot.until_found(len(keys))
         self.take = libero_take(1, 240)
         messages = self.take.messages
         robot.tell(self.take.started)
         done = 0
-        # At a tenth, two tenths ... of the episode; the kills a little apart from each other, so
-        # that they fall differently between two flushes.
+        # At one tenth, two tenths ... of the episode, and a little later each time, so that the
+        # kills have different distances from the last flush.
         for k, (key, number) in enumerate({**KILLED, **SIGNALS}.items(), 1):
             upto = self.sent[key] = len(messages) * k // 10 + 13 * k
-            # A busy machine keeps a recorder waiting: what is killed has caught up just before.
+            # On a busy machine a recorder may be late, so it catches up just before it is killed.
             caught_up = upto if key in SIGNALS else upto - LAST
             robot.send(messages[done:caught_up], rate_hz=RATE_HZ)
             self.graph.until(
@@ -103,13 +103,13 @@ def sessions(graph, robot):
 
 
 def test_two_recorders_on_one_dataset_make_one_bag(graph, sessions):
-    # The bag is there a moment before the recorder says so.
+    # The bag is there a moment before the recorder publishes that.
     closed = f"closed {sessions.take.name}"
     graph.until(lambda: any(closed in graph.log(key) for key in TOGETHER), closed)
-    said = {key: graph.log(key) for key in TOGETHER}
-    idle = [key for key in TOGETHER if "another recorder has this episode" in said[key]]
+    logs = {key: graph.log(key) for key in TOGETHER}
+    idle = [key for key in TOGETHER if "another recorder has this episode" in logs[key]]
     assert len(idle) == 1
-    assert [key for key in TOGETHER if closed in said[key]] == [
+    assert [key for key in TOGETHER if closed in logs[key]] == [
         key for key in TOGETHER if key not in idle
     ]
     assert all(graph.nodes.ended(key) is None for key in TOGETHER)
@@ -117,7 +117,7 @@ def test_two_recorders_on_one_dataset_make_one_bag(graph, sessions):
     assert read_episode(sessions.bag("first")).findings == ()
 
 
-def test_bag_has_what_was_sent_for_rosbags(sessions):
+def test_rosbags_reads_all_messages(sessions):
     sent = iter_sent(sessions.take)
     with AnyReader(
         [sessions.bag("first")], default_typestore=get_typestore(Stores.ROS2_JAZZY)
@@ -128,7 +128,7 @@ def test_bag_has_what_was_sent_for_rosbags(sessions):
     assert not any(list(rest) for rest in sent.values())
 
 
-def test_bag_has_what_was_sent_for_mcap(sessions):
+def test_mcap_reads_all_messages(sessions):
     sent = iter_sent(sessions.take)
     path = next(sessions.bag("first").glob("*.mcap"))
     for read in read_ros2_messages(path):
@@ -149,7 +149,7 @@ def iter_sent(take):
 
 
 @pytest.mark.parametrize("key", SIGNALS)
-def test_signal_in_mid_episode_leaves_a_whole_bag(sessions, key):
+def test_signal_during_an_episode_leaves_a_complete_bag(sessions, key):
     assert sessions.codes[key] == 0
     bag = open_bag(sessions.bag(key))
     assert (bag.path / "metadata.yaml").exists()
@@ -160,7 +160,7 @@ def test_signal_in_mid_episode_leaves_a_whole_bag(sessions, key):
 
 
 def test_kill_costs_a_fraction_of_a_second(graph, robot, sessions):
-    """Each is started again on its dataset, and finds what the killed one has left."""
+    """Each recorder is started again on its dataset, and recovers the partial bag."""
     for key in KILLED:
         assert sessions.codes[key] == -signal.SIGKILL
         assert not sessions.bag(key).exists()
@@ -171,14 +171,14 @@ def test_kill_costs_a_fraction_of_a_second(graph, robot, sessions):
         episode = read_episode(sessions.bag(key))
         assert "recovered" in {f.id for f in episode.findings}
         sent_ns = stamp_ns(sessions.take.messages[sessions.sent[key] - 1][1])
-        # Played faster than it was made.
+        # Played faster than real time.
         speed = 20.0 / RATE_HZ
         lost_s[key] = speed * (sent_ns - int(episode.stamps_ns[-1])) / 1e9
         kept = sessions.dataset(key) / "quarantine" / f"{sessions.take.id}.partial"
         graph.until(kept.is_dir, "the torn original")  # moved after the new bag is there
     print(f"lost by kill -9: {', '.join(f'{1e3 * s:.0f} ms' for s in lost_s.values())}")
-    # What was on disk is never lost. Of the rest a busy machine may keep one of them from all.
-    # A step that is not whole is lost, too.
+    # Messages on disk are never lost. On a busy machine one recorder may lose all others. An
+    # incomplete step is lost, too.
     n_topics = len(distinct(sessions.take.messages))
     assert max(lost_s.values()) < (LAST / n_topics + 1.0) / RATE_HZ + 1e-6
     assert min(lost_s.values()) < MOST_LOST_S
@@ -195,19 +195,19 @@ def test_latched_past_of_a_restarted_recorder_is_no_fault(graph, sessions):
 
 
 def test_known_id_is_refused(graph, robot, sessions):
-    """The owner plays an episode again that the dataset has: its bag stays what it was."""
+    """An episode that the dataset has already is played again. Its bag does not change."""
     bag = sessions.bag("int")
     before = {path.name: path.read_bytes() for path in bag.iterdir()}
     graph.start("recorder", "refusing", dataset=sessions.dataset("int"))
     graph.ready("refusing")
-    # The killed ones are still counted as subscribers, so nothing tells when this one is matched:
-    # the owner plays until it is.
-    said = "the dataset already has this episode"
+    # The killed recorders still count as subscribers, so the owner cannot tell when this one has
+    # found it. It plays until it has.
+    line = "the dataset already has this episode"
     for _ in range(5):
         robot.play(sessions.take)
         with suppress(AssertionError):
-            graph.until(lambda: said in graph.log("refusing"), said, timeout_s=3.0)
+            graph.until(lambda: line in graph.log("refusing"), line, timeout_s=3.0)
             break
-    graph.ready("refusing", line=said)
+    graph.ready("refusing", line=line)
     graph.stop("refusing", *TOGETHER)
     assert {path.name: path.read_bytes() for path in bag.iterdir()} == before

@@ -1,4 +1,4 @@
-"""What a recorder says of lost messages, of best effort, and of several publishers."""
+"""How a recorder reports lost messages, best effort, and several publishers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from curation_ros.dataset.episodes import read_episode
 
 pytestmark = pytest.mark.ros
 
-#: Three topics, so that many messages are quickly sent.
+#: Only three topics, so that many messages are sent quickly.
 SMALL = ("eef_position", "joint_position", "bowl_position")
 
 
@@ -34,7 +34,7 @@ def small(graph):
     best_effort = QoSProfile(depth=MAPPED.depth, reliability=ReliabilityPolicy.BEST_EFFORT)
     bowl = kept.fields["bowl_position"].topic
     with Robot(graph, kept, name="small_robot", qos={bowl: best_effort}) as robot:
-        robot.until_heard()
+        robot.until_found()
         yield dataset, robot
 
 
@@ -74,14 +74,14 @@ def test_best_effort_publisher_is_recorded(graph, small):
     assert offered["/eef_pose"] == "reliable"
 
 
-def test_stopped_recorder_takes_what_waits_for_it(graph, small):
-    """It was behind when it was told to stop."""
+def test_stopped_recorder_takes_pending_messages(graph, small):
+    """It is behind when the signal comes."""
     _, robot = small
     dataset = graph.folder / "behind"
     path = graph.folder / "small.yaml"
     with pausable():
         graph.start("recorder", "behind", dataset=dataset, topic_map=path)
-    robot.until_heard(2)
+    robot.until_found(2)
     take = small_take(6, 120)
     robot.tell(take.started)
     graph.ready("behind", line=f"recording {take.name}")
@@ -101,7 +101,7 @@ def test_stopped_recorder_takes_what_waits_for_it(graph, small):
 
 
 def test_lost_messages_are_counted(graph, small):
-    """A recorder that hangs for longer than its queues hold, and then goes on."""
+    """A recorder is paused for longer than its queues hold, and then continues."""
     dataset, robot = small
     take = small_take(3, 1400)
     robot.tell(take.started)
@@ -127,7 +127,7 @@ def test_second_publisher_makes_loss_unknown(graph, small):
     dataset, robot = small
     kept = topic_map().only(["eef_position"])
     with Robot(graph, kept, name="intruder", owner=False) as intruder:
-        intruder.until_heard()
+        intruder.until_found()
         take = robot.play(small_take(4, 50))
         bag, stats = recorded(graph, dataset, take)
     assert (stats["eef_pose"]["publishers"], stats["eef_pose"]["lost"]) == (2, None)
@@ -137,7 +137,7 @@ def test_second_publisher_makes_loss_unknown(graph, small):
 
 
 def test_publisher_that_changes_makes_loss_unknown(graph, small):
-    """Another node goes on in mid-episode, and its messages are numbered anew."""
+    """Another node takes over during the episode, and numbers its messages from the start."""
     dataset, robot = small
     take = small_take(5, 60)
     joints = take.until(0.5)
@@ -147,7 +147,7 @@ def test_publisher_that_changes_makes_loss_unknown(graph, small):
     robot.node.destroy_publisher(robot.publishers["joint_states"])
     kept = topic_map().only(["joint_position"])
     with Robot(graph, kept, name="successor", owner=False) as successor:
-        successor.until_heard()
+        successor.until_found()
         robot.publishers["joint_states"] = successor.publishers["joint_states"]
         robot.send(take.messages[joints:])
         robot.tell(take.ended)

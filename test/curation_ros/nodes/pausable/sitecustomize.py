@@ -1,7 +1,7 @@
-"""Python runs this first in a node that `pausing.pausable` has started: see there."""
+"""Python runs this first in a node that was started in `pausing.pausable`."""
 
 import signal
 
-# Threads that come later inherit it: only sigwait takes the signal then, however early it comes.
+# Later threads inherit the mask. Then only sigwait takes the signal, however early it comes.
 signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR2])
 signal.signal(signal.SIGUSR1, lambda *_: signal.sigwait([signal.SIGUSR2]))
