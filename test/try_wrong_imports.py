@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from copy import deepcopy
-from itertools import combinations, permutations
+from itertools import permutations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -175,10 +175,15 @@ class Contracts:
                 return contract.name
         return ""
 
-    def upward(self) -> Iterator[Import]:
-        """One import upwards for each pair of layers, and one for each pair of siblings."""
-        for higher, lower in combinations(self.layers, 2):
-            yield Import(self._a_module_of(lower[-1]), self._a_module_of(higher[0]))
+    def upward(self, *, reach: int | None = None) -> Iterator[Import]:
+        """One import upwards for each pair of layers, and one for each pair of siblings.
+
+        Args:
+            reach: how many layers up from each layer; None: all.
+        """
+        for k, lower in enumerate(self.layers):
+            for higher in reversed(self.layers[:k][-reach if reach else 0 :]):
+                yield Import(self._a_module_of(lower[-1]), self._a_module_of(higher[0]))
         for layer in self.layers:
             for one, other in permutations(layer, 2):
                 yield Import(self._a_module_of(one), self._a_module_of(other))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import fields, replace
 from functools import partial
 
@@ -33,6 +34,7 @@ CONSEQUENCE = ["object_coupling", "grip_consistency", "phase_events"]
 #: What orients these comes with the episode: they learn nothing.
 LEARNS_NOTHING = ("nothing", "object pose")
 HOUR_NS = 3_600_000_000_000
+_fitted: dict[str, Scorer] = {}
 
 
 @pytest.fixture(params=NAMES)
@@ -47,7 +49,10 @@ def reference(rng: np.random.Generator) -> list[Episode]:
 
 @pytest.fixture
 def fitted(name: str, reference: list[Episode]) -> Scorer:
-    return SCORERS[name]().fit(reference)
+    # Fitting takes most of the time, and the reference is the same in every test.
+    if name not in _fitted:
+        _fitted[name] = SCORERS[name]().fit(reference)
+    return deepcopy(_fitted[name])
 
 
 def state_bytes(scorer: Scorer) -> str:
