@@ -42,7 +42,7 @@ class AuditSettings:
 
     Attributes:
         labels: one of LABELS.
-        scorers: names in SCORERS. Rows of length alone are always added.
+        scorers: names of scorers. Rows of length alone are always added.
         scorer_params: scorer -> its hyper-parameters.
         length: one of LENGTHS, or empty for the default of `choose_length`.
         length_value: value of the length control, for modes that take one.
