@@ -178,16 +178,20 @@ def _read_summary(path: Path, stream: BinaryIO) -> McapInfo | None:
     info.start_ns, info.end_ns = statistics.message_start_time, statistics.message_end_time
     if statistics.metadata_count and not metadata_at:
         return None
-    stream.seek(len(MAGIC))
     for offset in [len(MAGIC), *metadata_at]:
-        stream.seek(offset)
-        head = stream.read(RECORD.size)
-        opcode, length = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
-        known = opcode in (Opcode.HEADER, Opcode.METADATA)
-        if not known or length > min(size - offset, MAX_RECORD_BYTES):
-            raise TornFileError(path, f"its index points at byte {offset}, where no record is")
-        _note(info, parse_record(path, offset, opcode, stream.read(length)))
+        _note(info, _record_at(path, stream, offset, size))
     return info
+
+
+def _record_at(path: Path, stream: BinaryIO, offset: int, size: int) -> Record:
+    """The header or metadata record at an offset that the file itself names."""
+    stream.seek(offset)
+    head = stream.read(RECORD.size)
+    opcode, length = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
+    known = opcode in (Opcode.HEADER, Opcode.METADATA)
+    if not known or length > min(size - offset, MAX_RECORD_BYTES):
+        raise TornFileError(path, f"its index points at byte {offset}, where no record is")
+    return parse_record(path, offset, opcode, stream.read(length))
 
 
 def _note_index(info: McapInfo, opcode: int, body: bytes, metadata_at: list[int]) -> None:

@@ -21,16 +21,16 @@ from curation_ros.core.errors import ConfigError, CurationError
 BACKENDS = ("loky", "ray", "dask")
 #: Tasks that are handed out ahead of the results, for each worker.
 AHEAD = 2
-# Tasks that a Ray worker is given at a time.
+# Tasks per batch for each Ray worker.
 _RAY_AHEAD = 4
-# How often a worker looks whether somebody still wants its results.
+# How often a worker checks that the process that started it still runs.
 _WATCH_S = 0.5
 
 Result = TypeVar("Result")
 
 
 class WorkerDiedError(CurationError):
-    """A worker was killed or ran out of memory; results that have come are whole."""
+    """A worker was killed or ran out of memory; the results before that are complete."""
 
 
 def check_workers(jobs: int, backend: str) -> None:
@@ -46,7 +46,7 @@ def check_workers(jobs: int, backend: str) -> None:
 
 
 def in_flight(jobs: int, backend: str, ray_ahead: int = _RAY_AHEAD) -> int:
-    """Most tasks that `spread` has handed out and not given the results of."""
+    """The most tasks that `spread` has handed out without a result at any time."""
     return ray_ahead * max(jobs, _RAY_AHEAD) if backend == "ray" else AHEAD * jobs
 
 
@@ -61,16 +61,17 @@ def spread(
 ) -> Iterator[Result]:
     """Call a function for every task, and yield the results.
 
-    Memory does not grow with the number of tasks: workers are given a few ahead.
+    Memory does not grow with the number of tasks: workers get only a few ahead.
 
     Args:
         function: goes to the workers with each task; its module must be importable there.
-        tasks: its arguments; taken one after another, in this process.
+        tasks: its arguments; an iterator runs in this process.
         jobs: workers; 1 works in this process, -1 takes all cores.
-        backend: one of BACKENDS, where there are several workers.
-        in_order: results in the order of the tasks; False: as they come (Ray keeps the order).
-        ray_ahead: tasks that Ray is given at a time, for each worker (at least for four): its
-            joblib backend gives no result before all of them are there.
+        backend: one of BACKENDS, used with several workers.
+        in_order: yield results in the order of the tasks; False: as they arrive (Ray keeps the
+            order).
+        ray_ahead: tasks per batch for each Ray worker, and for at least four workers. Ray's joblib
+            backend returns no result before a batch is complete.
 
     Raises:
         ConfigError: if the backend does not exist or is not installed.
@@ -82,10 +83,10 @@ def spread(
         return
     from joblib import Parallel, delayed
 
-    # Who interrupts us does not ask what became of the tasks ahead.
+    # After an interrupt, the tasks ahead are of no interest.
     warnings.filterwarnings("ignore", "[0-9]+ tasks ", UserWarning)
-    # loky starts a worker anew that has grown by 100 MB, as simulators and torch do; one that
-    # died is an error of ours.
+    # loky replaces a worker that has grown by 100 MB, as simulators and torch do. A worker that
+    # died is a WorkerDiedError.
     warnings.filterwarnings("ignore", "A worker stopped while some jobs ", UserWarning)
     with workers(backend, jobs), _deaths():
         if backend == "ray":
@@ -101,14 +102,14 @@ def spread(
 
 
 def _with_parent(function: Callable[..., Result], *task: Any) -> Result:
-    """Call a function in a worker that is not to outlive the process that asked for it."""
+    """Call a function in a worker that must not outlive the process that started it."""
     _watch_parent()
     return function(*task)
 
 
 @cache
 def _watch_parent() -> None:
-    """Once a process: end it when its parent has gone, as one that is killed cannot do that."""
+    """Once per process: end it when its parent is gone. A killed parent cannot end its workers."""
     parent = os.getppid()
 
     def watch() -> None:
@@ -121,7 +122,7 @@ def _watch_parent() -> None:
 
 @contextmanager
 def _deaths() -> Iterator[None]:
-    """Make one error of what the backends raise when a worker has died."""
+    """Turn the errors of the backends for a worker that died into one of ours."""
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     deaths: list[type[BaseException]] = [TerminatedWorkerError]
@@ -140,8 +141,8 @@ def _deaths() -> Iterator[None]:
 def workers(backend: str, jobs: int) -> Iterator[None]:
     """Make joblib use a kind of workers.
 
-    A Ray cluster is that of RAY_ADDRESS, a Dask cluster that of DASK_SCHEDULER_ADDRESS; where
-    these are not set, one is started on this machine and stopped at the end.
+    RAY_ADDRESS and DASK_SCHEDULER_ADDRESS name a cluster. If they are not set, one is started on
+    this machine and stopped at the end.
 
     Raises:
         ConfigError: if the backend is not installed.
@@ -162,8 +163,9 @@ def workers(backend: str, jobs: int) -> Iterator[None]:
 def _loky(jobs: int) -> Iterator[None]:
     from joblib import Parallel, delayed, effective_n_jobs
 
-    # Ctrl-C goes to all processes of a terminal; we end the workers, and none of them is to print
-    # a traceback. What is blocked when they start stays so in them; here it waits for a moment.
+    # Ctrl-C goes to all processes of a terminal, but this process ends the workers, and none of
+    # them may print a traceback. A signal that is blocked when they start stays blocked in them.
+    # Here it is only delayed.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         Parallel(n_jobs=jobs, backend="loky")(

@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="a selection; default: what the decisions in force keep or salvage",
     )
-    parser.add_argument("--force", action="store_true", help="overwrite a file that is there")
+    parser.add_argument("--force", action="store_true", help="overwrite a file that exists")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     by_ending = _ENDINGS.get(args.out.suffix.lower())
     if args.format is None and by_ending is None:
         raise ConfigError(
-            f"--out {args.out}: its ending is none of {', '.join(_ENDINGS)}: name a --format"
+            f"--out {args.out}: its ending is none of {', '.join(_ENDINGS)}; name a --format"
         )
     if args.format is not None and by_ending not in (None, args.format):
         raise ConfigError(f"--out {args.out} is not --format {args.format}: another ending")

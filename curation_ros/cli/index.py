@@ -1,4 +1,4 @@
-"""`curation index`: what a dataset holds; its index is a cache that can be made anew."""
+"""`curation index`: lists a dataset; rebuilds its index, which is only a cache."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("dataset", type=Path)
     parser.add_argument(
-        "--rebuild", action="store_true", help="make the index anew from bags and decision logs"
+        "--rebuild", action="store_true", help="rebuild the index from bags and decision logs"
     )
 
 
@@ -25,7 +25,7 @@ def run(args: argparse.Namespace) -> int:
     """Refresh or rebuild, then list the episodes with the decisions in force."""
     dataset = Dataset(args.dataset)
     if dataset.index.elsewhere:
-        warn(f"{dataset.index.elsewhere}: its index is {dataset.index.path}")
+        warn(f"{dataset.index.elsewhere}; its index is {dataset.index.path}")
     for problem in dataset.rebuild() if args.rebuild else dataset.refresh():
         warn(problem)
     decided = dataset.latest_decisions()

@@ -1,4 +1,4 @@
-"""`curation recover`: what an interrupted or damaged bag still holds, into a new one."""
+"""`curation recover`: saves what an interrupted or damaged bag still holds, in a new bag."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from curation_ros.cli.output import print_json, say
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("bag", type=Path, help="a bag, or its .mcap file; stays as it is")
+    parser.add_argument("bag", type=Path, help="a bag, or its .mcap file; it is not changed")
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of the new bag")
 
 

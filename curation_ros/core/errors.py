@@ -7,8 +7,8 @@ class CurationError(Exception):
     """Anything wrong with input, configuration or the outside world; the message is one line.
 
     Attributes:
-        finding: id in `findings.FINDINGS` of what is wrong with the input; empty where the input
-            is not to blame. A leaf's own stands where an error names none.
+        finding: id in `findings.FINDINGS` of what is wrong with the input; empty if the input is
+            not to blame. By default that of the class.
     """
 
     finding: str = ""
@@ -21,9 +21,9 @@ class CurationError(Exception):
 
 
 def _one_line(text: str) -> str:
-    """The text with line breaks and what else a terminal would obey written as escapes.
+    """The text with line breaks and other control characters as escapes.
 
-    Names of topics and files come from strangers.
+    Names of topics and files may have any.
     """
     if text.isprintable():
         return text

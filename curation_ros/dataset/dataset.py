@@ -260,11 +260,7 @@ class Dataset:
         return Index(self.path)
 
     def refresh(self) -> list[str]:
-        """Bring the index up to date with bags that were added or removed.
-
-        Returns:
-            One line for every bag that could not be read; the others are indexed all the same.
-        """
+        """Add new bags to the index and remove lost ones; returns what was unreadable."""
         present = {p.name: p for p in self.bags()}
         try:
             known = {e.id for e in self.index.episodes()}

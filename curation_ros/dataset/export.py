@@ -1,4 +1,4 @@
-"""Exports: what a dataset and its decisions say, for tools that know nothing of ours."""
+"""Exports of a dataset and its decisions, for tools that do not know this package."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from curation_ros.files import named_errors, write_atomically
 
 #: Format -> what it holds. The only list; the command line is made from it.
 FORMATS: dict[str, str] = {
-    "keep-json": 'the kept episodes alone: {"episodes": [id, ...], "names", "spans", ...}',
-    "csv": "a row an episode, kept or not; span_* is the decision's, selected_spans what is kept",
-    "parquet": "the same as csv, typed; needs the extra 'parquet'",
+    "keep-json": 'only the kept episodes: {"episodes": [id, ...], "names", "spans", ...}',
+    "csv": "one row per episode, kept or not; span_* of the decision, selected_spans as kept",
+    "parquet": "the same as csv, with types; needs the extra 'parquet'",
 }
 #: Columns of a row and their types, before one column `score/<scorer>` for each scorer.
 COLUMNS: dict[str, type] = {
@@ -51,24 +51,24 @@ def export(
     """Write one file about a dataset.
 
     Args:
-        dataset: whose decisions and bags.
+        dataset: it has the decisions and bags.
         out: the file.
         file_format: one of FORMATS.
         selection: name of a selection; empty: what the decisions in force keep or salvage.
-        force: overwrite a file that is there.
+        force: overwrite a file that exists.
 
     Returns:
         Path, format, number of episodes in the dataset, and of those selected.
 
     Raises:
         ConfigError: if the format does not exist or its library is missing.
-        CurationError: if the file is there already or cannot be written, the selection cannot be
+        CurationError: if the file exists already or cannot be written, the selection cannot be
             read, or there is nothing to export.
     """
     if file_format not in FORMATS:
         raise ConfigError(f"no format {file_format!r}; there are {', '.join(FORMATS)}")
     if file_format == "parquet":
-        _arrow()  # tell of a missing library before the work is done
+        _arrow()  # a missing library is an error before the work begins
     if out.exists() and not force:
         raise CurationError(f"{out} exists: --force overwrites it")
     names = dict(dataset.names())
@@ -106,7 +106,7 @@ def _manifest(dataset: Dataset, selection: str) -> Manifest:
 
 
 def _kept(decided: Mapping[str, Decision]) -> tuple[Entry, ...]:
-    """What the decisions in force keep, in the order of ids; of what is salvaged, the span."""
+    """What the decisions in force keep, in the order of ids; salvaged episodes with their span."""
     return tuple(
         Entry(d.episode, d.name, d.span if d.verdict == "salvage" else None)
         for _, d in sorted(decided.items())
@@ -119,11 +119,11 @@ def keep_json(entries: Sequence[Entry], manifest: Manifest | None) -> dict[str, 
 
     Args:
         entries: what is kept; an episode may appear with several spans.
-        manifest: the selection that they come from; None: the decisions in force.
+        manifest: their selection; None: the decisions in force.
 
     Returns:
-        `episodes` (ids, each once, in the order of the entries), `names` by id, `spans` by id (of
-        those kept in part: nanoseconds from the episode's start, inclusive), `selection`, `rule`.
+        `episodes` (ids, each once, in the order of the entries), `names` by id, `spans` by id (for
+        episodes kept in part: nanoseconds from the start, inclusive), `selection` and `rule`.
     """
     spans: dict[str, list[list[int]]] = {}
     for entry in entries:
@@ -148,15 +148,15 @@ def rows_of(
     decided: Mapping[str, Decision],
     selected: Mapping[str, Sequence[Span | None]],
 ) -> list[dict[str, Any]]:
-    """A row an episode, in the order of ids; None where something is not known.
+    """One row per episode, in the order of ids; None if something is not known.
 
-    Scores are those of the curator's last decision, also where a person has decided otherwise.
+    Scores are those of the curator's last decision, even if a person has overridden it.
 
     Args:
-        dataset: whose bags and decision logs.
+        dataset: it has the bags and decision logs.
         names: id -> short name of every episode.
         decided: id -> decision in force.
-        selected: id of each selected episode -> the spans that are kept of it, None: all of it.
+        selected: id of each selected episode -> the spans that are kept; None: all of it.
     """
     scored = {
         i: in_force(d for d in dataset.decisions(i) if d.by == CURATOR).get(i) or decision
@@ -191,11 +191,11 @@ def rows_of(
 
 
 def _extent(dataset: Dataset, episode_id: str) -> tuple[int | None, float | None]:
-    """Steps and seconds of an episode, as its owner counted them; None where nobody did."""
+    """Steps and seconds of an episode, as its owner counted them; None if it did not."""
     try:
         bag = open_bag(dataset.bag_path(episode_id))
         event, topic_map = bag.event(), bag.topic_map()
-    except CurationError:  # the bag has gone or is broken: the decision still has its row
+    except CurationError:  # the bag is gone or broken: the decision still has its row
         return None, None
     if event is None or topic_map is None or event.end_ns is None:
         return None, None
@@ -204,7 +204,7 @@ def _extent(dataset: Dataset, episode_id: str) -> tuple[int | None, float | None
 
 
 def _csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    """Text with a header; floats by `repr`, what is not known is empty."""
+    """Text with a header; floats by `repr`, unknown values empty."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()

@@ -1,4 +1,4 @@
-"""Recording without ROS: samples and episode events in, one bag an episode and notices out."""
+"""Recording without ROS: samples and episode events in, one bag per episode and notices out."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ class _TopicStats:
             self.longest_ns = max(self.longest_ns, step)
             if sample.seq and self.last_seq:
                 self.lost += max(0, sample.seq - self.last_seq - 1)
-                if sample.seq < self.last_seq:
-                    self.publishers = max(self.publishers, 2)  # another writer began to count
+                if sample.seq < self.last_seq:  # another publisher counts from its own start
+                    self.publishers = max(self.publishers, 2)
         self.last_seq, self.last_ns = sample.seq, sample.stamp_ns
 
 
@@ -81,10 +81,10 @@ class _OpenBag:
 
 
 class Recording:
-    """Writes one bag an episode into a dataset; each bag appears whole or is recovered later.
+    """Writes one bag per episode into a dataset; each bag appears whole or is recovered later.
 
-    While an episode runs its bag grows in `.partial/<id>`, under a file lock, so that a recorder
-    that starts can tell a bag in work from one whose recorder died.
+    While an episode runs, its bag is partial, and a file lock claims it. So a recorder that starts
+    can distinguish a bag that is being written from one whose recorder died.
     """
 
     def __init__(
@@ -104,10 +104,10 @@ class Recording:
             dataset: where bags go.
             topic_map: which topics are recorded.
             topics: topic of the map -> how it is subscribed.
-            min_free_mb: below this much free space no episode starts, and a running one is closed.
-            drain_timeout_s: patience for late samples after an episode ended.
-            flush_period_s: at most this much of an episode is lost to a kill.
-            publishers: number of publishers of a topic of the map, as the graph has it.
+            min_free_mb: with less free space no episode starts, and a running one is closed.
+            drain_timeout_s: how long to wait for late samples after an episode ended.
+            flush_period_s: at most this much of an episode is lost if the process is killed.
+            publishers: topic of the map -> number of its publishers on the graph.
         """
         self.dataset = dataset
         self.topic_map = topic_map
@@ -130,14 +130,14 @@ class Recording:
         return tuple(self._open)
 
     def free_mb(self) -> float:
-        """Free space of the dataset's disk; 0 where the disk has gone."""
+        """Free space of the dataset's disk; 0 if the disk is gone."""
         try:
             return shutil.disk_usage(self.dataset.path).free / 1e6
         except OSError:
             return 0.0
 
     def counts(self, episode_id: str) -> dict[str, int]:
-        """Distinct stamps by topic that an open episode has so far."""
+        """Distinct stamps per topic that an open episode has so far."""
         window = self.gate.window(episode_id)
         return window.counts() if window is not None else {}
 
@@ -156,7 +156,7 @@ class Recording:
         return notices + self._close_ready(now_s)
 
     def sample(self, sample: Sample, now_s: float) -> list[Notice]:
-        """Take a sample; the gate knows whether it belongs to an episode."""
+        """Take a sample, and write it if it belongs to an episode."""
         episode_id = self.gate.push(sample)
         notices = self._write(episode_id, sample) if episode_id is not None else []
         window = self.gate.window(episode_id) if episode_id is not None else None
@@ -165,7 +165,7 @@ class Recording:
         return notices
 
     def tick(self, now_s: float) -> list[Notice]:
-        """Flush, watch the free space, close what is complete; to be called every 0.1 s."""
+        """Flush, check the free space, and close complete bags; call it every 0.1 s."""
         notices = []
         if now_s - self._flushed_s >= self.flush_period_s:
             self._flushed_s = now_s
@@ -181,7 +181,7 @@ class Recording:
         return notices + self._close_ready(now_s)
 
     def abort(self, reason: str) -> list[Notice]:
-        """Close every open bag as aborted, keeping what it has."""
+        """Close every open bag as aborted; each keeps what it has."""
         notices = []
         for episode_id, bag in list(self._open.items()):
             end_ns = max((s.last_ns for s in bag.stats.values()), default=bag.event.start_ns)
@@ -226,7 +226,7 @@ class Recording:
     def _write(self, episode_id: str, sample: Sample) -> list[Notice]:
         bag = self._open.get(episode_id)
         if bag is None:
-            # Said only now: what is latched of an episode recorded long ago is no fault.
+            # Only a sample makes it a failure: `started` may be latched from long ago.
             if episode_id not in self._known:
                 return []
             self._known.remove(episode_id)
@@ -269,7 +269,7 @@ class Recording:
         return Notice("closed", event.id, event.name, reason, closed.counts)
 
     def _drop(self, bag: _OpenBag, reason: str) -> Notice:
-        """Remove a bag that has nothing in it."""
+        """Remove an empty bag."""
         bag.writer.abandon()
         shutil.rmtree(self.dataset.partials.path(bag.event.id), ignore_errors=True)
         self.dataset.partials.forget(bag.event.id)
@@ -277,7 +277,7 @@ class Recording:
         return Notice("failed", bag.event.id, bag.event.name, reason)
 
     def _fail(self, episode_id: str, reason: str) -> Notice:
-        """Give up a bag; what is on disk stays in `.partial` for the next start to recover."""
+        """Give up a bag; it stays partial, and the next recorder that starts recovers it."""
         bag = self._open.pop(episode_id)
         bag.writer.abandon()
         bag.lock.release()
@@ -338,7 +338,7 @@ def recover_partials(dataset: Dataset) -> list[Notice]:
 
 def _recover(dataset: Dataset, partial: Path) -> Notice:
     target = dataset.bag_path(partial.name)
-    if target.exists():  # a recovery was killed after its bag had appeared, which is then whole
+    if target.exists():  # a recovery was killed after its bag had appeared as a whole
         reason = "its bag is there already"
     else:
         scratch = partial.with_name(partial.name + RECOVERING)

@@ -17,7 +17,7 @@ from episodes import make_episode, topic_map
 
 from curation_ros.bags import QosProfile
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.episode.status import EpisodeEvent
+from curation_ros.core.episode.status import EpisodeEvent, Status
 from curation_ros.core.episode.stream import Sample
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.dataset.dataset import Dataset
@@ -29,6 +29,15 @@ ARM = tuple(f"robot0_joint{k}" for k in range(1, 8))
 FINGERS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
 #: Space that any machine of ours has.
 MIN_FREE_MB = 1.0
+
+
+def scores_from_status(status: Status) -> dict[str, float | None]:
+    """The scores of a decision, None where the scorer abstained."""
+    return {
+        k.removeprefix("score/"): float(v) if v else None
+        for k, v in status.values.items()
+        if k.startswith("score/")
+    }
 
 
 def short_episode(

@@ -1,4 +1,4 @@
-"""Findings: what was noticed about an episode, with a stable id, a kind and a time span."""
+"""Findings: what was found in an episode, with a stable id, a kind and a time span."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 Kind = Literal["recording", "motion", "task"]
 
-#: Every finding that there is: id -> (kind, what it means). The only list; docs are made from it.
-#: A recording fault says that the data are not what happened, odd motion that they are unusual,
-#: a failed task that they show no success; only the first kind keeps an episode from judgement.
+#: Every finding: id -> (kind, what it means). The only list; docs are made from it. After a fault
+#: of the recording the data do not show what happened, and the episode is not judged. Odd motion
+#: is unusual, and a failed task shows no success. Neither keeps an episode from being judged.
 FINDINGS: dict[str, tuple[Kind, str]] = {
     # The file: it could not be read, or not as an episode (`CurationError.finding`).
     "ambiguous": ("recording", "more than one file, topic or definition would do"),
@@ -35,7 +35,7 @@ FINDINGS: dict[str, tuple[Kind, str]] = {
     "unusable": ("recording", "no episode could be made of it"),
     "wrong-id": ("recording", "the folder is named after another episode than the bag is of"),
     "wrong-type": ("recording", "a topic has another type than the topic map says"),
-    # The samples: seen by the builder, the owner of the episode or the recorder.
+    # The samples: found by the builder, the owner of the episode or the recorder.
     "aborted": ("recording", "the owner of the episode gave it up"),
     "clock-back": ("recording", "stamps of a topic went back inside the episode"),
     "duplicate-stamp": ("recording", "two samples of one topic and stamp have different values"),
@@ -52,7 +52,7 @@ FINDINGS: dict[str, tuple[Kind, str]] = {
         "a topic has several publishers: lost messages cannot be counted",
     ),
     "unknown-phase": ("recording", "a phase name is not in the topic map"),
-    # The arrays: seen by `checks.check_episode`, and `duplicate` by who sees several episodes.
+    # The arrays: found by `checks.check_episode`; `duplicate` among several episodes.
     "clipped-start": ("recording", "it begins in mid-motion: its beginning was not recorded"),
     "duplicate": ("recording", "another episode has the same values at the same times"),
     "frozen": ("recording", "a measured topic repeats one value while the robot moves"),
@@ -72,7 +72,7 @@ FINDINGS: dict[str, tuple[Kind, str]] = {
 
 @dataclass(frozen=True)
 class Finding:
-    """Something noticed about an episode; spans are nanoseconds from its start stamp."""
+    """Something found in an episode; its span is in nanoseconds from the start stamp."""
 
     id: str
     message: str
@@ -80,7 +80,7 @@ class Finding:
 
     @property
     def kind(self) -> Kind:
-        """Broken recording, odd motion or failed task: never mixed."""
+        """Fault of the recording, odd motion or failed task."""
         return FINDINGS[self.id][0]
 
     def to_json(self) -> dict[str, object]:
@@ -97,7 +97,7 @@ class Finding:
         """Read what `to_json` wrote.
 
         Raises:
-            KeyError, TypeError, ValueError: if it is none.
+            KeyError, TypeError, ValueError: if it is no finding.
         """
         first, last = raw["span"]
         return cls(str(raw["id"]), str(raw["message"]), (int(first), int(last)))

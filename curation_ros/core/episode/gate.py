@@ -16,7 +16,7 @@ from curation_ros.core.types import NS_PER_S
 
 @dataclass
 class Window:
-    """An episode that is open: what its owner said, and what has arrived of each topic."""
+    """An episode that is open: what its owner announced, and what has arrived of each topic."""
 
     started: EpisodeEvent
     ended: EpisodeEvent | None = None
@@ -30,7 +30,7 @@ class Window:
         return self.started.start_ns <= stamp_ns and (end is None or stamp_ns <= end)
 
     def note(self, sample: Sample) -> None:
-        """Take note of a sample that belongs to the episode."""
+        """Note a sample that belongs to the episode."""
         self.stamps.setdefault(sample.topic, set()).add(sample.stamp_ns)
         self.newest_ns[sample.topic] = sample.stamp_ns
 
@@ -39,7 +39,7 @@ class Window:
         return {topic: len(stamps) for topic, stamps in self.stamps.items()}
 
     def end(self, event: EpisodeEvent, deadline_s: float) -> None:
-        """Take the end: what came after it does not belong to the window."""
+        """Take the end: later samples do not belong to the window."""
         self.ended, self.deadline_s = event, deadline_s
         for topic, stamps in self.stamps.items():
             self.stamps[topic] = {stamp for stamp in stamps if self.holds(stamp)}
@@ -62,9 +62,9 @@ class Closed:
     """An episode whose gate has closed.
 
     Attributes:
-        event: the ended or aborted event; its reason notes what was awaited in vain.
-        counts: distinct stamps that arrived, by topic.
-        missing: topics that were still awaited when the drain time was over.
+        event: the ended or aborted event; its reason names topics that fell silent too early.
+        counts: topic -> distinct stamps that arrived.
+        missing: topics that were incomplete when the drain time was over.
     """
 
     event: EpisodeEvent
@@ -75,10 +75,10 @@ class Closed:
 class EpisodeGate:
     """Routes samples into episodes by their stamps.
 
-    A sample belongs to an episode iff start_stamp <= stamp <= end_stamp. Samples that arrive
-    before `started` wait in a buffer of `max_gap_s` of stamp time. An episode closes when every
-    topic has passed the end stamp or reached its count, else `drain_timeout_s` after `ended`.
-    Receive time is used for that timeout only.
+    A sample belongs to an episode if start_stamp <= stamp <= end_stamp. Samples that arrive before
+    `started` wait in a buffer of `max_gap_s` of stamp time. An episode closes when every topic has
+    passed the end stamp or reached its count, at the latest `drain_timeout_s` after `ended`. Only
+    that timeout uses receive time.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class EpisodeGate:
         Args:
             topics: the mapped topics.
             max_gap_s: stamp time that is buffered before an episode starts.
-            drain_timeout_s: patience after `ended`, seconds of the caller's clock.
+            drain_timeout_s: how long to wait after `ended`, seconds of the caller's clock.
         """
         self.topics = tuple(topics)
         self.max_gap_s = max_gap_s
@@ -114,12 +114,12 @@ class EpisodeGate:
         """Take an event of the episode's owner.
 
         Args:
-            event: as received; a repeated `started` (a latched topic) changes nothing, unless an
-                episode is played again; an end without a start is ignored.
+            event: as received. A repeated `started` of a latched topic changes nothing, unless an
+                episode is replayed. An end without a start is ignored.
             now_s: any monotonic clock.
 
         Returns:
-            The buffered samples that belong to an episode that starts, in arrival order a topic.
+            The buffered samples of an episode that starts, in order of arrival per topic.
         """
         if event.event == "started":
             has_closed = any(e.id == event.id for e, _ in self._closed)
@@ -143,11 +143,11 @@ class EpisodeGate:
     def push(self, sample: Sample) -> str | None:
         """Take a sample; returns the id of the open episode it belongs to, if any.
 
-        Windows of one owner do not overlap; where they do, the younger episode gets the sample.
+        Windows of one owner do not overlap. If they do, the younger episode gets the sample.
         """
         owner = None
         for episode_id, window in reversed(self._windows.items()):
-            # The newest, not the highest: what is left of a clock that went back passes no end.
+            # The newest, not the highest: after a clock went back, old stamps pass no end.
             window.newest_ns[sample.topic] = sample.stamp_ns
             if owner is None and window.holds(sample.stamp_ns):
                 window.note(sample)
@@ -158,13 +158,6 @@ class EpisodeGate:
         while not horizon <= before[0][0].stamp_ns <= sample.stamp_ns:
             before.popleft()
         return owner
-
-    def late(self, sample: Sample) -> str | None:
-        """The closed episode that a sample came too late for, if any."""
-        for event, start_ns in self._closed:
-            if event.end_ns is not None and start_ns <= sample.stamp_ns <= event.end_ns:
-                return event.id
-        return None
 
     def close_ready(self, now_s: float) -> list[Closed]:
         """Close and return the episodes that are complete, aborted or out of time."""
@@ -183,9 +176,9 @@ class EpisodeGate:
         return done
 
     def _is_taken(self, sample: Sample, owner: str | None) -> bool:
-        """Whether a sample is another episode's for good: its stamp may fit into several.
+        """Whether a sample belongs to another episode, although its stamp fits into several.
 
-        It does where the clock went back between episodes, or one is played again.
+        It does if the clock went back between episodes, or one is replayed.
         """
         for episode_id, window in self._windows.items():
             if episode_id == owner:
@@ -198,10 +191,10 @@ class EpisodeGate:
 
 
 def _noting(event: EpisodeEvent, missing: Iterable[str]) -> EpisodeEvent:
-    """An ended event that says which topics fell silent before the end.
+    """An ended event whose reason names the topics that fell silent before the end.
 
-    Only where the owner has not counted: the builder compares counts itself, and finds topics
-    without any sample. As a line of the reason it goes into the bag, and with a replay.
+    Only those that the owner did not count: the builder compares counts itself, and finds topics
+    without any sample. A line of the reason goes into the bag, and from there into a replay.
     """
     if event.event != "ended":
         return event

@@ -24,20 +24,20 @@ def is_uuid(text: str) -> bool:
 
 
 def foreign_episode_id(sha256_hex: str, start_ns: int) -> str:
-    """Identity of an episode in a bag that we did not record.
+    """Identity of an episode that our recorder did not record.
 
     Args:
-        sha256_hex: digest of the bag's first .mcap file.
+        sha256_hex: digest of its recording, such as the first .mcap file of a bag.
         start_ns: first stamp of the episode.
 
     Returns:
-        A UUID version 5, the same on every machine for the same file.
+        A UUID version 5, the same on every machine for the same recording.
     """
     return str(uuid.uuid5(uuid.NAMESPACE_URL, f"sha256:{sha256_hex}:{start_ns}"))
 
 
 def resolve_prefix(prefix: str, names_by_id: Iterable[tuple[str, str]]) -> str:
-    """Find the one episode that a person means by a short name or the beginning of an id.
+    """Find the one episode with a short name, or with an id that begins with a text.
 
     Args:
         prefix: what was typed: a whole id, an unambiguous beginning of one, or a short name.

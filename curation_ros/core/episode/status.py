@@ -31,7 +31,7 @@ class Status:
 
 @dataclass(frozen=True)
 class EpisodeEvent:
-    """An event of topic `episode`; its owner alone says where an episode starts and ends.
+    """An event of the topic `episode`; only its owner decides where an episode starts and ends.
 
     Attributes:
         id, name: identity of the episode.
@@ -39,7 +39,8 @@ class EpisodeEvent:
         start_ns, end_ns: window, inclusive; end_ns is None until the end.
         counts: topic of the map -> number of distinct stamps in the window, at the end.
         source: live or replay.
-        reason: why it was aborted, and what the owner knows of the recording (`owner_findings`).
+        reason: why it was aborted, and what the owner knows about the recording, see
+            `owner_findings`.
     """
 
     id: str
@@ -103,12 +104,12 @@ def event_from_status(status: Status) -> EpisodeEvent:
 
 
 def counts_to_values(counts: Mapping[str, int]) -> dict[str, str]:
-    """Write numbers of samples by topic."""
+    """Write the number of samples per topic."""
     return {_COUNT + topic: str(n) for topic, n in sorted(counts.items())}
 
 
 def counts_from_status(status: Status) -> dict[str, int]:
-    """Read numbers of samples by topic.
+    """Read the number of samples per topic.
 
     Raises:
         ValueError: if one is no number.
@@ -157,9 +158,9 @@ def event_from_json(raw: Mapping[str, Any]) -> EpisodeEvent:
 
 
 def owner_findings(event: EpisodeEvent) -> list[Finding]:
-    """Findings that no sample shows: an event's `reason` has them, one `id: message` a line.
+    """Findings that no sample shows, from the lines `id: message` of an event's `reason`.
 
-    They travel with the event, so that live, replayed and offline episodes have the same ones.
+    They travel with the event, so live, replayed and offline episodes have the same ones.
     """
     whole = (0, max(0, (event.end_ns or event.start_ns) - event.start_ns))
     found = []
@@ -181,7 +182,7 @@ def phase_to_status(episode_id: str, label: str, index: int, progress: float) ->
 
 
 def alert_to_status(episode_id: str, name: str, finding: Finding) -> Status:
-    """Write an alert: what has just gone wrong, while the episode runs."""
+    """Write an alert: what went wrong while the episode runs."""
     values = {
         "reason": finding.message,
         "span_start": str(finding.span[0]),
@@ -190,7 +191,7 @@ def alert_to_status(episode_id: str, name: str, finding: Finding) -> Status:
     return Status(ERROR, name, finding.id, episode_id, values)
 
 
-#: Level that a verdict is shown with.
+#: Verdict -> level of its status.
 VERDICT_LEVEL = {"keep": OK, "salvage": WARN, "review": WARN, "discard": ERROR}
 
 
@@ -214,12 +215,3 @@ def decision_to_status(
     }
     values |= {_SCORE + k: "" if v is None else repr(float(v)) for k, v in scores.items()}
     return Status(VERDICT_LEVEL[verdict], name, verdict, episode_id, values)
-
-
-def scores_from_status(status: Status) -> dict[str, float | None]:
-    """Read the scores of a decision; None where the scorer abstained."""
-    return {
-        k.removeprefix(_SCORE): float(v) if v else None
-        for k, v in status.values.items()
-        if k.startswith(_SCORE)
-    }

@@ -31,8 +31,9 @@ class Sample(NamedTuple):
     """One message of a mapped topic.
 
     `topic` is the name in the topic map, not the resolved one: namespaces and remaps end at the
-    node. `seq` is the publication sequence number; 0 where there is none (then arrival decides).
-    `log_ns` and `publish_ns` are when it was received and sent: for bags, never to join anything.
+    node. `seq` is the publication sequence number, or 0 if there is none (then arrival decides).
+    `log_ns` and `publish_ns` are when it was received and sent. Bags store them; nothing joins by
+    them.
     """
 
     topic: str
@@ -97,7 +98,7 @@ def rows_at(buffer: npt.NDArray[np.uint8], starts: Stamps, size: int) -> npt.NDA
 
 
 class SampleBlock(NamedTuple):
-    """Samples of one topic in their order; its arrays have a value a message."""
+    """Samples of one topic in their order; its arrays have one value per message."""
 
     topic: str
     stamps_ns: Stamps
@@ -109,7 +110,7 @@ class Columns(NamedTuple):
     """Values that a decoder has read from n messages at k paths.
 
     Attributes:
-        values: (n, k) numbers; what stands in a column of texts or a bad row has no meaning.
+        values: (n, k) numbers; columns of texts and bad rows have no meaning.
         texts: column -> (n,) unicode array, where a path leads to a text.
         bad: row -> why its message could not be read.
     """
@@ -122,7 +123,7 @@ class Columns(NamedTuple):
 class Decoder(Protocol):
     """Turns CDR bytes of one message type into columns; `curation_ros.bags.cdr` has the real one.
 
-    The core knows no message definitions, so that it needs neither ROS nor a bag to be imported.
+    The core knows no message definitions, so it can be imported without ROS and bags.
     """
 
     def has_header(self, type_name: str) -> bool:
@@ -132,8 +133,8 @@ class Decoder(Protocol):
     def decode_block(self, type_name: str, paths: Sequence[str], messages: Messages) -> Columns:
         """Read the values at `paths` from every message; a message that does not fit is bad.
 
-        Numbers and booleans become float64. A message is bad if it is shorter than its type says,
-        or if the element or the name of a joint that a path asks for is not in it.
+        Numbers and booleans become float64. A message is bad if it is too short for its type, or
+        lacks the element or the joint of a path.
         """
         ...
 
@@ -175,8 +176,8 @@ def header_stamps_ns(messages: Messages) -> Stamps:
 def playback_order(samples: Sequence[Sample]) -> list[Sample]:
     """Samples in stamp order across topics, in recorded order within a topic.
 
-    Where stamps of a topic go back, its samples stay in their order, so that whoever listens sees
-    the same fault as the recorder did.
+    If stamps of a topic go back, its samples stay in their order, so that a subscriber gets the
+    same fault as the recorder did.
 
     Args:
         samples: of one bag, in file order.

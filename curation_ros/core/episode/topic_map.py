@@ -15,7 +15,7 @@ from curation_ros.core.yaml_file import read_yaml
 
 ROLES = ("clock", "observation", "action", "gripper", "phase", "object", "effector")
 STAMPS = ("header", "source")
-#: How a state column is made of a field: as it runs, or its first value held.
+#: End of a name in `state` and `action` that stands for the first value of a field.
 AT_START = "@start"
 
 
@@ -28,7 +28,7 @@ class FieldSpec:
         topic: relative topic name, resolved by the node that subscribes.
         type: ROS message type, such as `sensor_msgs/msg/JointState`.
         role: one of ROLES.
-        values: paths into the message, one a column: `pose.position.x`, `position.panda_joint1`
+        values: paths into the message, one per column: `pose.position.x`, `position.panda_joint1`
             (the element whose `name` is panda_joint1), `status.0.values.progress` (the value whose
             `key` is progress; digits are an index).
         unit: unit of the columns, for people and reports.
@@ -57,8 +57,8 @@ class GripperSpec:
         opens: sign of the command that opens, -1 or +1.
         kind: `binary` (the sign decides, 0 holds) or `continuous` (nearer to the open end opens).
         open_value, closed_value: ends of the command's range.
-        fingers: the field with finger positions, or empty where there is none; its columns'
-            spread is larger when open.
+        fingers: the field with finger positions, or empty if there is none. The spread of its
+            columns is larger when open.
     """
 
     field: str
@@ -78,7 +78,7 @@ class TopicMap:
     Attributes:
         fields: by name, in the order of the file.
         clock: name of the field whose stamps are the episode's clock.
-        gripper: its meaning, or None where the robot has none.
+        gripper: its meaning, or None if the robot has none.
         state, action: columns of the state and action that the paper's metrics see: field names,
             a trailing `@start` holds a field's first value, a phase field becomes a one-hot.
         max_gap_s: silence longer than this marks the episode.
@@ -100,7 +100,7 @@ class TopicMap:
 
     @property
     def command_topics(self) -> frozenset[str]:
-        """Topics that carry actions: they answer an observation, so they join forwards."""
+        """Topics that carry actions. They answer an observation, so they join forwards."""
         return frozenset(s.topic for s in self.fields.values() if s.role in ("action", "gripper"))
 
     @property
@@ -114,7 +114,7 @@ class TopicMap:
         return self.fields[self.clock].topic
 
     def only(self, names: Iterable[str]) -> TopicMap:
-        """The map with these fields alone, for who needs no others; its clock stays if it is kept.
+        """The map with only these fields; its clock stays if it is one of them.
 
         Raises:
             ConfigError: if a name is no field, or there is none.
@@ -174,7 +174,7 @@ def _reject_unknown(found: Mapping[str, Any], known: set[str], where: str) -> No
 
 
 def _texts(raw: object, what: str) -> tuple[str, ...]:
-    """A list of texts; where there is nothing, an empty one."""
+    """A list of texts; an empty one for None."""
     if raw is None:
         return ()
     if isinstance(raw, Sequence) and not isinstance(raw, str):

@@ -67,7 +67,7 @@ def test_csv_says_what_score_says(curation: Run, folder: Path, data: Path, tmp_p
         (["--out", "new", "--format", "nose"], USAGE, "nose"),
         (["--out", "new", "--format", "csv", "--selection", "nose"], USAGE, "nose.json"),
         (["--out", "taken", "--format", "csv"], NOTHING, "taken exists: --force overwrites it"),
-        (["--out", "new.txt"], USAGE, "none of .json, .csv, .parquet: name a --format"),
+        (["--out", "new.txt"], USAGE, "none of .json, .csv, .parquet; name a --format"),
         (["--out", "new.csv", "--format", "parquet"], USAGE, "is not --format parquet"),
         (["--out", "nowhere/new.csv"], USAGE, "there is no folder"),
     ],

@@ -9,8 +9,8 @@ import pytest
 from graph import DECISIONS, DiagnosticArray, KeyValue
 from robot import Robot, libero_take
 from std_srvs.srv import Trigger
+from streams import scores_from_status
 
-from curation_ros.core.episode.status import scores_from_status
 from curation_ros.dataset.dataset import Dataset
 
 pytestmark = pytest.mark.ros

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from streams import scores_from_status
 
 from curation_ros.core.decision.decision import VERDICTS
 from curation_ros.core.episode.findings import Finding
@@ -26,7 +27,6 @@ from curation_ros.core.episode.status import (
     event_to_status,
     owner_findings,
     phase_to_status,
-    scores_from_status,
 )
 from curation_ros.core.errors import EpisodeError
 
