@@ -25,6 +25,8 @@ from curation_ros.reporting.rows import (
 )
 from curation_ros.reporting.salvage_section import salvage_blocks
 
+#: Phases of a pool in results that do not name them: those of the first task.
+_FIRST_PHASES = ("PREGRASP", "DESCEND", "GRASP", "LIFT", "TRANSPORT", "RELEASE")
 _SCREEN = (
     "Screening: few seeds, many cells. These figures are for looking around; nothing is claimed "
     "from them. What is claimed stands among the planned contrasts."
@@ -203,6 +205,7 @@ def _traces(results: JsonObject) -> Iterator[Block]:
             [
                 panels.traces_panel(
                     pool["traces"],
+                    pool.get("phases", _FIRST_PHASES),
                     set(row["episodes"]),
                     f"{name}: {row['row']}, AUROC {number(row['auroc'])}",
                 )

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MultipleLocator, PercentFormatter
 
 from curation_ros.batch import published
-from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.types import JsonObject
 from curation_ros.reporting.drawing import Drawing
 from curation_ros.reporting.plotting import (
@@ -278,11 +277,14 @@ def _draw_contrast(axes: Axes, line: int, one: JsonObject) -> None:
     )
 
 
-def traces_panel(traces: Sequence[JsonObject], kept: set[str], title: str) -> Drawing:
+def traces_panel(
+    traces: Sequence[JsonObject], phases: Sequence[str], kept: set[str], title: str
+) -> Drawing:
     """Object height and gripper of kept and discarded demonstrations, phase by phase.
 
     Args:
         traces: `traces` of a pool.
+        phases: names of their phases, each of which has the same number of points.
         kept: ids of the episodes that are kept.
         title: title of the panel.
     """
@@ -301,7 +303,7 @@ def traces_panel(traces: Sequence[JsonObject], kept: set[str], title: str) -> Dr
             n_good = sum(bool(t["good"]) for t in some)
             what = f"{title}\nkept" if is_kept else "discarded"
             grid[0, column].set_title(f"{what}: {len(some)}, {n_good} good", loc="left")
-            _phase_axis(grid[1, column], some)
+            _phase_axis(grid[1, column], some, phases)
         grid[0, 0].set_ylabel("object height, m")
         grid[1, 0].set_ylabel("gripper")
         grid[1, 0].set_yticks([-1, 1], ["open", "close"])
@@ -310,17 +312,17 @@ def traces_panel(traces: Sequence[JsonObject], kept: set[str], title: str) -> Dr
     return Drawing(draw, f"object height and gripper over the phases, {title}", (4.8, 4.0))
 
 
-def _phase_axis(axes: Axes, traces: Sequence[JsonObject]) -> None:
+def _phase_axis(axes: Axes, traces: Sequence[JsonObject], phases: Sequence[str]) -> None:
     """Name the phases on the horizontal axis, and draw their limits in the axes above, too."""
     n = max((len(t["gripper"]) for t in traces), default=0)
-    width = n / len(PHASES)
     axes.set_xticks([])
-    if not n:
+    if not n or not phases:
         return
+    width = n / len(phases)
     axes.set_xlim(-0.5, n - 0.5)
     axes.set_xticks(
-        [width * (k + 0.5) - 0.5 for k in range(len(PHASES))],
-        [phase.lower() for phase in PHASES],
+        [width * (k + 0.5) - 0.5 for k in range(len(phases))],
+        [phase.lower() for phase in phases],
         rotation=60,
         ha="right",
         rotation_mode="anchor",
@@ -328,5 +330,5 @@ def _phase_axis(axes: Axes, traces: Sequence[JsonObject]) -> None:
     )
     for above in axes.get_shared_x_axes().get_siblings(axes):
         above.tick_params(axis="x", length=0)
-        for k in range(1, len(PHASES)):
+        for k in range(1, len(phases)):
             above.axvline(width * k - 0.5, color="#e4e4e4", linewidth=0.6, zorder=0)

@@ -170,11 +170,18 @@ def _facts(pool: Pool, audited: Audit, scoring_hash: str) -> JsonObject:
         "steps": [len(pool.timelines[i]) for i in pool.episodes],
         "release_steps": sorted(released[i] for i in pool.episodes if i in released),
         "length_control": audited.facts["length_control"],
+        "phases": list(_phases(pool)),
         "scoring_hash": scoring_hash,
     }
     if pool.curated is not None:
         facts["curator"] = compare_with_truth(pool.curated, pool.good, released, pool.timelines)
     return facts
+
+
+def _phases(pool: Pool) -> tuple[str, ...]:
+    """Names of the phases that the traces show."""
+    first = next(iter(pool.timelines.values()), None)
+    return first.phase_labels if first is not None else ()
 
 
 # --- traces -------------------------------------------------------------------------------------

@@ -225,6 +225,7 @@ def _pool(folder: Path, name: str, plan: StudyPlan, rng: np.random.Generator) ->
             "length_control": {
                 "mode": "shortest-reference", "value": None, "steps": 215, "needs": "reference",
             },
+            "phases": ["FIRST", "SECOND", "THIRD", "FOURTH", "FIFTH", "SIXTH"],
             "scoring_hash": "0" * 16,
             **curator,
         },

@@ -23,10 +23,10 @@ from pausing import PAUSE, RESUME, pausable
 
 from curation_ros.cli.main import main as curation
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.episodes import read_episode
+from sim_node.tasks.pick_and_place import PHASES
 
 pytestmark = [pytest.mark.ros, pytest.mark.sim, pytest.mark.policy]
 pytest.importorskip("libero", reason="LIBERO is not installed")

@@ -89,6 +89,18 @@ def test_equal_results_give_equal_bytes(
         assert one.read_bytes() == other.read_bytes(), one.name
 
 
+def test_traces_are_drawn_with_the_phases_of_their_pool(
+    found: dict[str, Any], report: list[Path], tmp_path: Path
+) -> None:
+    name = "figure-traces-paired.svg"
+    assert "second</text>" in (report[0].parent / name).read_text()
+    found["pools"]["paired"].pop("phases")  # as in results of older versions
+    write_report(found, tmp_path)
+    old = (tmp_path / name).read_text()
+    assert "descend</text>" in old
+    assert "second</text>" not in old
+
+
 def test_text_in_figures_is_text(report: list[Path]) -> None:
     text = (report[0].parent / "figure-main.svg").read_text()
     assert "gripper timing</text>" in text

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from episodes import copied, make_episode, shifted, topic_map, with_fields
 
-from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.errors import EpisodeError
 
 STEP_NS = 50_000_000
@@ -40,7 +39,7 @@ def test_missing_field_is_named_beside_those_there_are() -> None:
 
 def test_phase_and_its_names_come_from_the_map() -> None:
     episode = make_episode()
-    assert episode.phase_labels == PHASES
+    assert episode.phase_labels == topic_map().fields["phase"].labels != ()
     phase = episode.phase
     assert phase is not None
     assert phase.tolist() == episode.field("phase")[:, 0].tolist()
@@ -54,7 +53,7 @@ def test_state_and_action_are_the_columns_of_the_map() -> None:
     episode = make_episode()
     assert topic_map().state == ("eef_position", "finger_position", "bowl_position@start", "phase")
     state = episode.state
-    assert state.shape == (len(episode), 3 + 2 + 3 + len(PHASES))
+    assert state.shape == (len(episode), 3 + 2 + 3 + len(episode.phase_labels))
     np.testing.assert_array_equal(state[:, :3], episode.field("eef_position"))
     np.testing.assert_array_equal(
         state[:, 5:8], np.tile(episode.field("bowl_position")[0], (240, 1))

@@ -12,7 +12,6 @@ from streams import scores_from_status
 
 from curation_ros.core.decision.decision import VERDICTS
 from curation_ros.core.episode.findings import Finding
-from curation_ros.core.episode.phases import PHASES
 from curation_ros.core.episode.status import (
     ERROR,
     OK,
@@ -168,7 +167,7 @@ def test_owner_findings_are_the_same_after_every_way_an_event_can_travel() -> No
 
 
 def test_phase_has_index_and_progress() -> None:
-    status = phase_to_status("i", PHASES[2], 2, 1 / 3)
+    status = phase_to_status("i", "GRASP", 2, 1 / 3)
     assert (status.message, status.hardware_id, status.level) == ("GRASP", "i", OK)
     assert dict(status.values) == {"index": "2", "progress": "0.3333333333333333"}
 
