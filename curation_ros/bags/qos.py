@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from curation_ros.bags.yaml_text import dump_yaml, load_yaml
+from curation_ros.core.types import NS_PER_S
 
 # RMW_DURATION_INFINITE, the largest int64 in nanoseconds.
 _INFINITE_NS = 9_223_372_036_854_775_807
-_NS_PER_S = 1_000_000_000
 
 # Numbers of rmw/types.h, which bags before version 9 have instead of names.
 _NAMES: dict[str, dict[int, str]] = {
@@ -111,7 +111,7 @@ def qos_from_yaml(text: str) -> tuple[QosProfile, ...]:
 
 
 def _duration(ns: int | None) -> dict[str, int]:
-    sec, nsec = divmod(_INFINITE_NS if ns is None else ns, _NS_PER_S)
+    sec, nsec = divmod(_INFINITE_NS if ns is None else ns, NS_PER_S)
     return {"sec": sec, "nsec": nsec}
 
 
@@ -120,6 +120,6 @@ def _nanoseconds(raw: Any) -> int | None:
         return None
     sec, nsec = int(raw.get("sec", 0)), int(raw.get("nsec", 0))
     # Older versions and some vendors write infinity as the largest 32-bit numbers.
-    if sec >= _INFINITE_NS // _NS_PER_S or {sec, nsec} <= {2147483647, 4294967295}:
+    if sec >= _INFINITE_NS // NS_PER_S or {sec, nsec} <= {2147483647, 4294967295}:
         return None
-    return sec * _NS_PER_S + nsec
+    return sec * NS_PER_S + nsec
