@@ -16,11 +16,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from curation_ros.batch.examine import EpisodesOf, Examiner, judge_bags
+from curation_ros.batch.score import Scored, Scoring
 from curation_ros.configuration import read_reference
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import CURATOR, Decision, Verdict
-from curation_ros.core.decision.examination import Examination
 from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import CurationError
@@ -120,7 +119,7 @@ def self_check(
                 f"dataset {dataset.path}: there is no label to flip: neither a label in "
                 "truth.jsonl nor a decision of a person, here or in the reference"
             )
-        before, after = (_decide(c, settings, topic_map) for c in (plain, other))
+        before, after = (_score(c, settings, topic_map) for c in (plain, other))
     if not any(before.values()) and not any(after.values()):
         raise CurationError(f"dataset {dataset.path}: no episode that can be scored")
     differences = [
@@ -183,8 +182,9 @@ def _copy(source: Dataset, target: Dataset, *, flip: bool) -> tuple[int, int]:
     for episode_id in source.decided_ids():
         decisions = source.decisions(episode_id)
         overrides += sum(d.by != CURATOR for d in decisions)
-        lines = [(_flipped_decision(d) if flip else d).to_line() + "\n" for d in decisions]
-        write_atomically(target.decision_log(episode_id), "".join(lines))
+        copied = [_flipped_decision(d) if flip else d for d in decisions]
+        lines = [json.dumps(d.to_json(), allow_nan=False) for d in copied]
+        write_atomically(target.decision_log(episode_id), "".join(f"{k}\n" for k in lines))
     return labels, overrides
 
 
@@ -219,22 +219,20 @@ def _flipped_decision(decision: Decision) -> Decision:
     return replace(decision, verdict=_OPPOSITE_VERDICT[decision.verdict])
 
 
-def _decide(
+def _score(
     copies: _Copies, settings: CurationSettings, topic_map: TopicMap | None
 ) -> dict[str, dict[str, Any] | None]:
     """Bag -> examination and decision as plain data; None if the bag cannot be read."""
+    reference = read_reference(copies.reference, topic_map) if copies.reference else []
+    curation = Curation.fit(settings, reference)
     bags = list(copies.dataset.bags())
-    trusted = copies.reference
-    curation = Curation.fit(settings, read_reference(trusted, topic_map) if trusted else [])
-    if curation.scorers.needs_dataset:
-        curation = curation.fit_dataset(EpisodesOf(bags, topic_map))
-    examiner = Examiner(curation.scorers, topic_map, fresh=True)
-    results: dict[str, dict[str, Any] | None] = {}
-    for one, decision in judge_bags(examiner, curation, bags, tie=copies.dataset.tie(0)):
-        results[one.path.name] = None
-        if decision is not None and isinstance(one.result, Examination):
-            results[one.path.name] = {**one.result.to_json(), **decision.to_json()}
-    return results
+    scoring = Scoring(bags, curation, topic_map=topic_map, fresh=True)
+    return {
+        result.path.name: {**result.examination.to_json(), **result.decision.to_json()}
+        if isinstance(result, Scored)
+        else None
+        for result in scoring
+    }
 
 
 def _compare(

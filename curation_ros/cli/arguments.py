@@ -1,4 +1,4 @@
-"""Arguments that several commands take, each described once."""
+"""Arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def add_reference(parser: argparse.ArgumentParser) -> None:
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
-    """`--config` and `--topic-map`: the files that a person configures scoring by."""
+    """`--config` and `--topic-map`: the files that configure scoring."""
     parser.add_argument(
-        "--config", type=Path, help="scorers and rule; default config/curation.yaml"
+        "--config", type=Path, help="YAML file of scorers and rule; default: config/curation.yaml"
     )
     parser.add_argument(
-        "--topic-map", type=Path, help="default: the one that is stored in the bag"
+        "--topic-map", type=Path, help="YAML file of the topic map; default: the map in each bag"
     )
 
 
@@ -38,7 +38,7 @@ def add_rule(parser: argparse.ArgumentParser, default: str) -> None:
         parser: of a command.
         default: which rule the command uses if none is named.
     """
-    # Importing the rules takes 0.2 s, which commands without rules do not wait for.
+    # Importing the rules takes 0.2 s, and most commands have none.
     from curation_ros.core.decision.groups import METHODS
     from curation_ros.core.decision.rules import RULES
 
@@ -49,12 +49,15 @@ def add_rule(parser: argparse.ArgumentParser, default: str) -> None:
     parser.add_argument("--value", type=float, help="threshold, share or number of the --rule")
     methods = "; ".join(f"{name}: {text}" for name, text in METHODS.items())
     parser.add_argument(
-        "--method", choices=tuple(METHODS), default="", help=f"of --rule gap; {methods}"
+        "--method",
+        choices=tuple(METHODS),
+        default="",
+        help=f"how --rule gap separates groups; {methods}",
     )
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:
-    """`--jobs` and `--backend`: over how many workers, of which kind, work is spread."""
+    """`--jobs` and `--backend`: number and kind of the workers."""
     parser.add_argument(
         "--jobs", type=int, default=1, metavar="N", help="workers; -1 takes all cores"
     )
@@ -62,5 +65,6 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
         "--backend",
         choices=BACKENDS,
         default="loky",
-        help="of the workers: processes here, or a cluster (RAY_ADDRESS, DASK_SCHEDULER_ADDRESS)",
+        help="kind of the workers: processes here (loky), or a cluster (RAY_ADDRESS, "
+        "DASK_SCHEDULER_ADDRESS)",
     )

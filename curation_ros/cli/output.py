@@ -16,21 +16,21 @@ VERDICT_STYLE = {"keep": "green", "salvage": "cyan", "review": "yellow", "discar
 
 
 def print_json(row: Mapping[str, Any]) -> None:
-    """One JSON line; null, never NaN."""
+    """Print one JSON line; NaN is an error."""
     print(json.dumps(row, allow_nan=False), flush=True)
 
 
 def say(text: str) -> None:
-    """A line as it is: a path that was broken into two would be of no use."""
+    """Print a line without wrapping, so that paths can be copied."""
     console.print(text, markup=False, soft_wrap=True)
 
 
 def warn(problem: object) -> None:
-    """A line about something that did not stop us."""
+    """Print a line about a problem that did not stop the command."""
     progress_console.print(f"warning: {problem}", style="yellow", markup=False, soft_wrap=True)
 
 
 def percent(successes: int, n: int, interval: tuple[float, float]) -> str:
-    """`7 of 10 (70 %, 95 % interval 40 to 89 %)`."""
+    """A share with its interval: `7 of 10 (70%, 95 % interval 40% to 89%)`."""
     low, high = interval
     return f"{successes} of {n} ({successes / n:.0%}, 95 % interval {low:.0%} to {high:.0%})"

@@ -7,37 +7,37 @@ import getpass
 from pathlib import Path
 
 from curation_ros.cli.output import print_json, say
+from curation_ros.core.decision.decision import VERDICTS
 from curation_ros.core.errors import ConfigError
 from curation_ros.dataset.dataset import Dataset
-from curation_ros.live.curator import OVERRIDES, override
+from curation_ros.dataset.decision_log import log_override
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("dataset", type=Path)
     parser.add_argument("episode", help="short name, id, or the beginning of an id")
-    parser.add_argument("verdict", choices=OVERRIDES)
+    parser.add_argument("verdict", choices=VERDICTS)
     parser.add_argument(
         "--until",
         type=float,
         metavar="SECONDS",
-        help="with salvage: the part that is kept ends there, from the start of the episode",
+        help="with salvage: end of the part that is kept, from the start of the episode",
     )
-    parser.add_argument("--reason", default="", help="in your words")
-    parser.add_argument("--by", default="", help="who decides; default: the user's name")
+    parser.add_argument("--reason", default="", help="in your own words")
+    parser.add_argument("--by", default="", help="your name; default: the name of the user")
 
 
 def run(args: argparse.Namespace) -> int:
     """Log the decision."""
     if (args.verdict == "salvage") != (args.until is not None):
         raise ConfigError("--until belongs to salvage, and salvage needs --until SECONDS")
-    decision = override(
+    decision = log_override(
         Dataset(args.dataset),
         args.episode,
         args.verdict,
         args.reason,
         args.by or _user(),
-        state_hash="",
         until_s=args.until,
     )
     if args.json:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from curation_ros.bags import episode_of, open_bag
 from curation_ros.core.decision.balance import Balance, balance_of, phase_steps
-from curation_ros.core.decision.decision import CURATOR, Decision, in_force, untrustworthy
+from curation_ros.core.decision.decision import Decision, own_decisions, untrustworthy
 from curation_ros.core.decision.manifest import Entry, Manifest
 from curation_ros.core.decision.rules import given_params, make_rule
 from curation_ros.core.decision.selection import Candidate, check_selects, select
@@ -62,8 +62,9 @@ def save_selection(
     if not bags:
         raise ConfigError(f"dataset {dataset.path}: no episode to select from")
     decided = dataset.latest_decisions()
-    scored = {bag.name: _scored(dataset, bag.name) for bag in bags} if ruler.reads_scores else {}
+    scored: dict[str, Decision] = {}
     if ruler.reads_scores:
+        scored = own_decisions(d for bag in bags for d in dataset.decisions(bag.name))
         _check_scored(dataset, scorer, scored)
     names = dict(dataset.names())
     candidates = [
@@ -74,7 +75,7 @@ def save_selection(
     chosen = select(candidates, ruler, seed=seed, tie=dataset.tie(seed), resolution=resolution)
     now = datetime.now(timezone.utc)
     basis = scored if ruler.reads_scores else decided
-    hashes = {d.state_hash for d in basis.values() if d is not None}
+    hashes = {d.state_hash for d in basis.values()}
     used = ruler.params().get(ruler.value_param) if ruler.value_param else None
     manifest = Manifest(
         name=name or f"{rule}-{now:%Y%m%dT%H%M%S%f}",
@@ -92,19 +93,13 @@ def save_selection(
     return manifest, dataset.save_manifest(manifest)
 
 
-def _scored(dataset: Dataset, episode_id: str) -> Decision | None:
-    """The curator's last decision: its scores count, whatever a person decided."""
-    own = in_force(d for d in dataset.decisions(episode_id) if d.by == CURATOR)
-    return own.get(episode_id)
-
-
-def _check_scored(dataset: Dataset, scorer: str, scored: Mapping[str, Decision | None]) -> None:
+def _check_scored(dataset: Dataset, scorer: str, scored: Mapping[str, Decision]) -> None:
     """Refuse a scorer that no logged decision asked.
 
     Raises:
         ConfigError: with the command that logs them.
     """
-    if any(d is not None and scorer in d.scores for d in scored.values()):
+    if any(scorer in d.scores for d in scored.values()):
         return
     is_fitted = is_scorer(scorer) and find_scorer(scorer).needs == "reference"
     raise ConfigError(

@@ -31,7 +31,7 @@ from curation_ros.core.episode.stream import Sample
 from curation_ros.core.errors import CurationError
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.manifests import save_selection
-from curation_ros.live.curator import Decided, LiveCuration
+from curation_ros.live.curator import Decided, LiveCurator
 from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import single_from_ros, status_to_ros
 from curation_ros.nodes.parameters import Parameter, declare
@@ -67,7 +67,7 @@ class Curator(WorkingNode):
         paths = [Path(path).expanduser() for path in p["reference"]]
         curation = Curation.fit(settings, read_reference(paths, topic_map) if paths else [])
         dataset = Dataset(Path(p["dataset"]).expanduser(), create=True)
-        self._live = LiveCuration(
+        self._live = LiveCurator(
             dataset, topic_map, CdrDecoder(), curation, drain_timeout_s=p["drain_timeout_s"]
         )
         known = dataset.latest_decisions(_N_RECENT).values()

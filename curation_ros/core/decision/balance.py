@@ -11,13 +11,13 @@ from curation_ros.core.errors import ConfigError
 if TYPE_CHECKING:
     from curation_ros.core.episode.episode import Episode
 
-#: A phase that fewer than this share of the demonstrations show is worth a word.
+#: A phase that a smaller share of the demonstrations shows than this one is worth a warning.
 LEAST_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class Shown:
-    """How many demonstrations show a phase by at least one step, and all its steps."""
+    """How many demonstrations have a step of a phase, and their steps in all."""
 
     demonstrations: int
     steps: int
@@ -29,8 +29,8 @@ class Balance:
 
     Attributes:
         n: demonstrations in the set.
-        n_known: of these, those whose phases are known.
-        phases: name -> how much of it, of all phases that their topic maps name.
+        n_known: those of them whose phases are known.
+        phases: name -> how much is shown of it, for all phases of their topic maps.
     """
 
     n: int
@@ -38,11 +38,11 @@ class Balance:
     phases: Mapping[str, Shown]
 
     def warnings(self) -> list[str]:
-        """A line for people on each phase that too few demonstrations show."""
+        """A line for people about each phase that too few demonstrations show."""
         return [
             f"{name} is shown by {shown.demonstrations} of {self.n_known} demonstrations kept: "
-            "a policy sees little of it; record more that come so far, or look whether some "
-            "were cut too early or left out wrongly"
+            "a policy sees little of it; record more demonstrations that reach it, or check "
+            "whether some were cut too early or left out wrongly"
             for name, shown in self.phases.items()
             if shown.demonstrations < LEAST_SHARE * self.n_known
         ]
@@ -50,10 +50,10 @@ class Balance:
     def describe(self) -> str:
         """One line for people."""
         if not self.n_known:
-            return "phases: not known: the topic map names none"
+            return "phases: unknown, because the topic map names none"
         shown = ", ".join(f"{name} {s.demonstrations}" for name, s in self.phases.items())
         missing = self.n - self.n_known
-        unknown = f"; of {missing} others they are not known" if missing else ""
+        unknown = f"; unknown for {missing} others" if missing else ""
         return f"phases shown by {self.n_known} demonstrations: {shown}{unknown}"
 
     def to_json(self) -> dict[str, Any]:
@@ -85,12 +85,11 @@ def phase_steps(episode: Episode, span: tuple[int, int] | None = None) -> dict[s
     """How many steps of each phase an episode has.
 
     Args:
-        episode: it needs its phase alone.
+        episode: only its phase is needed.
         span: of the episode, nanoseconds from its start, inclusive; None: all of it.
 
     Returns:
-        Every phase of its topic map -> steps, 0 where it shows none; None where the map has no
-        phase.
+        Every phase of its topic map -> steps, 0 where it shows none; None if the map has no phase.
     """
     part = episode if span is None else episode.within(span)
     phase = part.phase
@@ -103,8 +102,8 @@ def balance_of(parts: Iterable[tuple[str, Mapping[str, int] | None]]) -> Balance
     """What demonstrations show together.
 
     Args:
-        parts: (episode id, its `phase_steps`, None where they are not known); an episode that is
-            there with several spans is one demonstration.
+        parts: pairs of an episode id and its `phase_steps`, which are None if they are unknown. An
+            episode with several spans is one demonstration.
     """
     steps: dict[str, int] = {}
     showing: dict[str, set[str]] = {}

@@ -1,8 +1,7 @@
-"""Decisions: what becomes of an episode, why, from where to where, and on what evidence."""
+"""Decisions: what becomes of an episode, why, which part of it, and on what evidence."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -14,12 +13,13 @@ from curation_ros.core.errors import EpisodeError
 Verdict = Literal["keep", "salvage", "review", "discard"]
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 
-#: Author of the decisions that are not a person's.
+#: Author of decisions that no person made.
 CURATOR = "curator"
 
-#: Findings of the recording that are noted in the decision and stop nothing; all others need a
-#: person, for what was recorded may not be what happened. (A bag that cannot be read: the live
-#: episode stands. Lost messages that cannot be counted: a hole that matters is also a `gap`.)
+#: Findings of the recording that are noted in the decision and stop nothing. All others need a
+#: person, because what was recorded may not be what happened. Without a readable bag the live
+#: episode stands. Lost messages that cannot be counted matter only if they leave a hole, which is
+#: also a `gap`.
 NOTED = ("unknown-loss", "unknown-phase", "no-bag")
 
 
@@ -34,16 +34,16 @@ class Decision:
 
     Attributes:
         episode, name: identity of the episode.
-        verdict: keep, salvage (keep the span alone), review (a person is to look), or discard.
+        verdict: keep, salvage (keep only the span), review (ask a person), or discard.
         reason: one sentence that an operator understands.
         span: nanoseconds from the start stamp, inclusive; the whole episode by default.
         scores: scorer -> score, None where it abstained.
         abstained: scorer -> why.
-        findings: faults of the recording.
+        findings: faults of the recording, unusual motion, failed task.
         evidence: what the verdict rests on, as plain JSON values.
-        revision: 1, 2, ... an episode; the log gives the number.
+        revision: 1, 2, ... per episode; the log gives the number.
         by: `curator`, or the name of the person.
-        state_hash: fitted state that the decision is a function of.
+        state_hash: hash of the fitted state that the decision is a function of.
     """
 
     episode: str
@@ -66,7 +66,7 @@ class Decision:
                 f"{', '.join(VERDICTS)}"
             )
         if not 0 <= self.span[0] <= self.span[1]:
-            raise EpisodeError(f"decision on {self.episode}: span {self.span} is none")
+            raise EpisodeError(f"decision on {self.episode}: span {self.span} makes no sense")
         for scorer, score in self.scores.items():
             if score is not None and not math.isfinite(score):
                 raise EpisodeError(
@@ -91,13 +91,9 @@ class Decision:
             "state_hash": self.state_hash,
         }
 
-    def to_line(self) -> str:
-        """One line of JSON, without its newline."""
-        return json.dumps(self.to_json(), allow_nan=False)
-
     @classmethod
     def from_json(cls, raw: object) -> Decision:
-        """Read what `to_json` wrote; keys that it does not know are left alone.
+        """Read what `to_json` wrote; unknown keys are ignored.
 
         Raises:
             EpisodeError: if a key is missing or a value makes no sense.
@@ -125,19 +121,6 @@ class Decision:
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as err:
             raise EpisodeError(f"decision: {type(err).__name__} {err} in {raw!r:.200}") from err
 
-    @classmethod
-    def from_line(cls, line: str) -> Decision:
-        """Read what `to_line` wrote.
-
-        Raises:
-            EpisodeError: if the line is no JSON, or no decision.
-        """
-        try:
-            raw = json.loads(line)
-        except ValueError as err:
-            raise EpisodeError(f"decision: no JSON: {err} in {line!r:.80}") from err
-        return cls.from_json(raw)
-
 
 def override(
     previous: Decision,
@@ -153,7 +136,9 @@ def override(
         EpisodeError: if no person is named, or the verdict makes no sense.
     """
     if not by or by == CURATOR:
-        raise EpisodeError(f"override of {previous.episode}: by {by!r} is no person")
+        raise EpisodeError(
+            f"override of {previous.episode}: by {by!r}: expected the name of a person"
+        )
     return replace(
         previous,
         verdict=verdict,
@@ -167,7 +152,7 @@ def override(
 def in_force(decisions: Iterable[Decision]) -> dict[str, Decision]:
     """The decision that counts for each episode.
 
-    A person outranks the curator, whatever the curator decides later; among equals the highest
+    A person outranks the curator, whatever the curator decides later. Among equals the highest
     revision counts, and the later one of equal revisions.
 
     Args:
@@ -179,6 +164,15 @@ def in_force(decisions: Iterable[Decision]) -> dict[str, Decision]:
         if held is None or _rank(decision) >= _rank(held):
             found[decision.episode] = decision
     return found
+
+
+def own_decisions(decisions: Iterable[Decision]) -> dict[str, Decision]:
+    """The curator's last decision for each episode, whatever people decided.
+
+    Args:
+        decisions: in the order of their logs.
+    """
+    return in_force(d for d in decisions if d.by == CURATOR)
 
 
 def _rank(decision: Decision) -> tuple[bool, int]:

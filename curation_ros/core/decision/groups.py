@@ -1,4 +1,4 @@
-"""Whether scores fall into two groups, and where one would cut."""
+"""Whether scores fall into two groups, and where to cut between them."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ import numpy as np
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.types import Floats
 
-#: How two groups are told from one; the only list.
+#: How two groups are told from one: method -> its criterion. The only list.
 METHODS: dict[str, str] = {
     "mixture": "two normal groups instead of one, by the Bayesian information criterion",
     "largest-gap": "a gap between neighbouring scores of twice the next largest",
 }
 #: Fewer scores than this say nothing about groups.
 MIN_SCORES = 8
-# Strong evidence in the words of Kass and Raftery (1995) is 6 to 10, very strong above 10.
+# Kass and Raftery (1995) call 6 to 10 strong evidence, and more than 10 very strong.
 _MIN_BIC_GAIN = 10.0
-# Two normal groups make two humps where Ashman's D exceeds 2 (Ashman et al. 1994, equation 11).
-# One skewed group passes for two far too often at 2 (47 % of exponential samples of 80; at 4 with
-# the least share 0 %), and groups that people would cut between are wider apart.
+# Two normal groups make two humps if Ashman's D exceeds 2 (Ashman et al. 1994, equation 11). At 2
+# one skewed group passes for two far too often: 47 % of exponential samples of 80. At 4 with the
+# least share it is 0 %. Groups that people would cut between are further apart than that.
 _MIN_ASHMAN_D = 4.0
 _MIN_GROUP = 2
 _MIN_SHARE = 0.1
 _GAP_RATIO = 2.0
-# Spread that a group has at least, as a share of the range: groups of equal scores are no points.
+# Least spread of a group as a share of the range, because a group of equal scores has none.
 _SPREAD_FLOOR = 1e-3
 _CERTAIN = 0.95
 
@@ -38,8 +38,8 @@ class Split:
     """Two groups of scores, or the reason why there is one.
 
     Attributes:
-        cut: the upper group lies above it; None where there are no two groups.
-        doubt: scores between these two (exclusive) belong to neither group for sure.
+        cut: the upper group lies above it; None if there are no two groups.
+        doubt: scores between these two, both excluded, may belong to either group.
         n_upper: scores above the cut.
         why: what was found, for people.
     """
@@ -61,9 +61,9 @@ def split_scores(
         method: one of METHODS.
 
     Returns:
-        The split. With `mixture` the cut lies in the widest gap between the means of the groups,
-        and scores that belong to either with less than 95 % are in doubt; with `largest-gap`
-        nothing is.
+        The split. With `mixture` the cut lies in the widest gap between the means of the groups.
+        Scores that belong to neither group with 95 % are in doubt. With `largest-gap` none is in
+        doubt.
 
     Raises:
         ConfigError: for a method that does not exist, or a score that is not finite.
@@ -107,7 +107,7 @@ def _largest_gap(x: Floats, resolution: float) -> Split:
 
 
 def _mixture(x: Floats, resolution: float) -> Split:
-    # Importing scikit-learn takes seconds: only who fits a mixture waits for it.
+    # Importing scikit-learn takes seconds, which only fitting a mixture needs.
     from sklearn.mixture import GaussianMixture
 
     scale = float(x[-1] - x[0])
@@ -116,7 +116,7 @@ def _mixture(x: Floats, resolution: float) -> Split:
     column = z[:, None]
     bic = []
     with warnings.catch_warnings():
-        # It warns where it stops before its tolerance; such a fit is judged like any other.
+        # It warns if it stops before its tolerance. Such a fit is compared like any other.
         warnings.simplefilter("ignore")
         for n in (1, 2):
             model = GaussianMixture(n, reg_covar=floor**2, n_init=3, random_state=0, max_iter=500)
@@ -143,7 +143,7 @@ def _mixture(x: Floats, resolution: float) -> Split:
     low = float(grid[np.flatnonzero(upper <= 1 - _CERTAIN)[-1]]) if upper[0] < 0.05 else mean[0]
     high = float(grid[np.flatnonzero(upper >= _CERTAIN)[0]]) if upper[-1] > 0.95 else mean[1]
     cut = float(z[at] + z[at + 1]) / 2
-    # Where the widest gap lies beside the band of doubt, the gap has the say.
+    # If the widest gap lies outside the band of doubt, the band is extended to it.
     low, high = min(low, cut), max(high, cut)
     return Split(
         float(x[0] + scale * cut),

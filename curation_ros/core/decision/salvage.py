@@ -1,4 +1,4 @@
-"""What can be saved of an episode: of a recording that is bad at an end, of a task that failed."""
+"""The part of an episode that can be saved: of a bad recording, and of a failed task."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from curation_ros.core.types import NS_PER_S
 if TYPE_CHECKING:
     from curation_ros.core.episode.episode import Episode
 
-#: Faults that say exactly which steps they spoil: the rest is as good as if they were not there.
-#: Of all others (a hole, lost messages) only a person can say what they have cost.
+#: Faults of known steps: the other steps are as good as without the fault. What another fault (a
+#: hole, lost messages) has cost, only a person can tell.
 CONFINED = ("padded-tail", "not-finite")
-#: A part shorter than this share of the episode is no demonstration any more.
+#: A shorter part of the episode than this share is no demonstration any more.
 _LEAST_SHARE = 0.5
-#: What a good beginning keeps away from the break, unless something else is asked for.
+#: A good beginning ends this long before the break, unless configured otherwise.
 DEFAULT_MARGIN_S = 0.75
 #: A beginning shorter than this shows nothing of a task.
 LEAST_PREFIX_S = 1.0
 
 
 def sound_part(episode: Episode, faults: Iterable[Finding]) -> tuple[int, int] | None:
-    """First and last step of what is left when spoilt ends are cut off.
+    """First and last step of what is left after damaged ends are cut off.
 
     Args:
-        episode: the episode, whole.
+        episode: the whole episode.
         faults: its findings that need a person.
 
     Returns:
-        None where nothing is spoilt, a fault spoils more than an end, or too little is left.
+        None if nothing is damaged, a fault damages more than the ends, or too little is left.
     """
     found = list(faults)
     if not found or any(f.id not in CONFINED for f in found):
@@ -48,7 +48,7 @@ def sound_part(episode: Episode, faults: Iterable[Finding]) -> tuple[int, int] |
     if len(steps) in (0, len(episode)):
         return None
     first, last = int(steps[0]), int(steps[-1])
-    whole = last - first + 1 == len(steps)  # a spoilt step inside is no spoilt end
+    whole = last - first + 1 == len(steps)  # a damaged step lies between good ones
     if not whole or len(steps) < max(2.0, _LEAST_SHARE * len(episode)):
         return None
     return first, last
@@ -58,12 +58,12 @@ def good_prefix(episode: Episode, broke_at: int, margin_s: float) -> tuple[int, 
     """First and last step of the beginning of an episode, up to a margin before it broke.
 
     Args:
-        episode: the episode, whole.
+        episode: the whole episode.
         broke_at: step at which something went wrong.
-        margin_s: at least so long before that step the beginning ends, in seconds of its stamps.
+        margin_s: the beginning ends at least this long before that step, in seconds of its stamps.
 
     Returns:
-        None where less than LEAST_PREFIX_S is left.
+        None if less than LEAST_PREFIX_S is left.
     """
     until_ns = int(episode.stamps_ns[broke_at]) - max(1, round(margin_s * NS_PER_S))
     last = int(np.searchsorted(episode.stamps_ns, until_ns, side="right")) - 1

@@ -11,7 +11,7 @@ import numpy as np
 
 
 def state_hash(state: object) -> str:
-    """SHA-256 of a state as 64 hexadecimal digits: equal exactly when the states are.
+    """SHA-256 of a state as 64 hexadecimal digits, equal for equal states.
 
     Args:
         state: None, numbers, texts, arrays, and lists, tuples and mappings of such.
@@ -25,7 +25,7 @@ def state_hash(state: object) -> str:
 
 
 def _feed(digest: Any, value: object) -> None:
-    """Feed a value to a hash, with its type, so that no two states look alike."""
+    """Feed a value to a hash, with its type, so that no two states give the same bytes."""
     if isinstance(value, Mapping):
         digest.update(f"map{len(value)}".encode())
         for key in sorted(value):

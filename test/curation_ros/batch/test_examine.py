@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ import pytest
 from episodes import make_episode, make_reference
 from streams import record
 
-from curation_ros.batch.examine import Copies, EpisodesOf, Examined, Examiner, judge_bags
+from curation_ros.batch.examine import Examined, Examiner
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.examination import Examination
 from curation_ros.core.decision.fitted_scorers import FittedScorers, Looks
@@ -133,7 +133,7 @@ def test_killed_run_goes_on_where_it_stopped(data: Path, fitted: Curation, tmp_p
     assert 0 < kept < 4 * N_BAGS
     done = subprocess.run(command[:-3] + command[-2:], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert f"scored {4 * N_BAGS}, of which {kept} were known" in done.stderr
+    assert f"{4 * N_BAGS} scored ({kept} cached), 0 unreadable" in done.stderr
 
 
 def test_rebuilding_the_index_forgets_what_was_examined(data: Path, fitted: Curation) -> None:
@@ -214,59 +214,7 @@ def test_bad_options_are_refused(fitted: Curation, options: dict[str, object]) -
         Examiner(fitted.scorers, **options)  # type: ignore[arg-type]
 
 
-# --- copies and rules over the dataset ----------------------------------------------------------
-
-
-def test_copy_of_an_episode_is_found_whatever_it_is_called(data: Path, fitted: Curation) -> None:
-    original = make_episode(np.random.default_rng(5), episode_id=new_episode_id(), name="first")
-    record(Dataset(data), original)
-    record(Dataset(data), replace(original, id=new_episode_id(), name="again"))
-    judged = list(judge_bags(Examiner(fitted.scorers), fitted, bags_of(data)))
-    copies = [d for _, d in judged if d and any(f.id == "duplicate" for f in d.findings)]
-    assert [(d.name, d.verdict) for d in copies] == [("again", "review")]
-    assert copies[0].reason == f"duplicate: same content as episode {original.id}"
-
-
-def test_copies_are_told_by_content_alone() -> None:
-    seen = Examination("a", "pick-1", 5, (0, 9), {}, content="ab" * 32)
-    copies = Copies()
-    assert copies.note(seen) == seen
-    assert copies.note(replace(seen, episode="b", content="cd" * 32)).findings == ()
-    assert [f.id for f in copies.note(replace(seen, episode="c")).findings] == ["duplicate"]
-    empty = replace(seen, episode="d", steps=0)
-    assert copies.note(empty) == empty
-
-
-def test_share_is_of_the_trusted_episodes_and_final(data: Path) -> None:
-    broken = make_episode(np.random.default_rng(5), name="broken")
-    shutil.copytree(record(Dataset(data), broken), data / "episodes" / new_episode_id())
-    rule = {"rule": "top-fraction", "rule_scorer": "length", "rule_params": {"value": 0.5}}
-    curation = Curation.fit(CurationSettings(scorers=SCORERS, **rule))  # type: ignore[arg-type]
-    judged = [d for _, d in judge_bags(Examiner(curation.scorers), curation, bags_of(data)) if d]
-    assert {d.evidence["basis"] for d in judged} == {"final"}
-    assert {d.evidence["fitted_on"]["episodes"] for d in judged} == {N_BAGS + 1}
-    assert len({d.evidence["fitted_on"]["hash"] for d in judged}) == 1
-    left_out = [d for d in judged if d.verdict == "discard"]
-    assert len(left_out) == 20  # of 41, half are kept, rounded as a person does
-    for decision in judged:
-        reasons = {"wrong-id", "opened-early"} & {f.id for f in decision.findings}
-        assert (decision.verdict == "review") <= bool(reasons), decision
-
-
-def test_twins_are_fitted_on_the_dataset_itself(data: Path) -> None:
-    curation = Curation.fit(
-        CurationSettings(
-            scorers=("knn_label_free", "length"), rule="gap", rule_scorer="knn_label_free"
-        )
-    )
-    assert curation.scorers.needs_dataset
-    seen = [e.result for e in Examiner(curation.scorers).run(bags_of(data))]
-    assert all(isinstance(e, Examination) and e.scores["knn_label_free"] is None for e in seen)
-    before = curation.scorers.scoring_hash
-    curation = curation.fit_dataset(EpisodesOf(bags_of(data), None))
-    assert curation.scorers.scoring_hash != before
-    again = [e.result for e in Examiner(curation.scorers).run(bags_of(data))]
-    assert all(isinstance(e, Examination) and e.scores["knn_label_free"] for e in again)
+# --- several at once ----------------------------------------------------------------------------
 
 
 def test_processes_that_score_at_once_agree(data: Path, tmp_path: Path) -> None:

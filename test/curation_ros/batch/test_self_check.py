@@ -21,7 +21,7 @@ from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import CurationError
 from curation_ros.core.scorers import SCORERS, Look
 from curation_ros.dataset.dataset import Dataset
-from curation_ros.live.curator import log_decision, override
+from curation_ros.dataset.decision_log import log_decision, log_override
 
 TRUTH: dict[str, Any] = {
     "name": "pick-0",
@@ -177,7 +177,7 @@ def test_scorer_that_follows_people_is_found(told: Dataset, cheat: str) -> None:
     for bag in told.bags():
         [name] = [n for i, n in told.names() if i == bag.name]
         log_decision(told, decide_on(fitted, make_episode(episode_id=bag.name, name=name)))
-        override(told, bag.name, "keep", "fine", "Ada", "")
+        log_override(told, bag.name, "keep", "fine", "Ada")
     done = self_check(told, _settings(cheat))
     assert done.overrides == 4
     assert {d.field for d in done.differences} >= {"score/cheat"}

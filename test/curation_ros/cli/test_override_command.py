@@ -68,9 +68,9 @@ def test_beginning_of_an_id_is_enough(curation: Run, folder: Path) -> None:
         (["pick-0", "salvage", "--until", "soon"], USAGE, "soon"),
         (["pick-0", "salvage", "--until", "nan"], NOTHING, "until nan s: expected from 1 s"),
         (["pick-0", "salvage", "--until", "0.5"], NOTHING, "expected from 1 s to less than 11.96"),
-        (["pick-0", "salvage", "--until", "11.96"], NOTHING, "11.96 s, which is all of it"),
+        (["pick-0", "salvage", "--until", "11.96"], NOTHING, "11.96 s, the whole episode"),
         (["pick-0"], USAGE, "verdict"),
-        (["pick-0", "keep", "--by", "curator"], NOTHING, "is no person"),
+        (["pick-0", "keep", "--by", "curator"], NOTHING, "expected the name of a person"),
     ],
 )
 def test_wrong_override_is_one_line_and_a_code(

@@ -360,7 +360,7 @@ def test_decision_of_a_person_that_counts_is_named_where_nothing_is_written(
     assert curation("override", data, "pick-0", "discard", "--by", "Ada", "--json").code == DONE
     told = curation("score", data, *_options(folder), "--json")
     assert told.rows == rows
-    assert "a person decided otherwise, and that counts: pick-0 (discard, by Ada)" in told.err
+    assert "overridden by a person (their decision stands): pick-0 (discard, by Ada)" in told.err
 
 
 @pytest.mark.parametrize("as_json", [True, False])
@@ -454,4 +454,6 @@ def test_reference_among_what_is_scored_is_told(curation: Run, folder: Path) -> 
 
 def test_summary_counts_verdicts(curation: Run, folder: Path) -> None:
     told = curation("score", folder / "data", *_options(folder))
-    assert "2 keep, 1 review, 2 discard; scored 5" in " ".join(told.err.split())
+    assert "2 keep, 1 review, 2 discard; 5 scored (0 cached), 0 unreadable" in " ".join(
+        told.err.split()
+    )

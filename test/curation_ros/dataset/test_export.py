@@ -19,9 +19,9 @@ from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.decision_log import log_override
 from curation_ros.dataset.export import COLUMNS, FORMATS, export, keep_json
 from curation_ros.dataset.manifests import save_selection
-from curation_ros.live.curator import override
 
 VERDICTS = ("keep", "salvage", "review", "discard")
 SPAN = (1, 50_000_000)
@@ -183,7 +183,7 @@ def test_parquet_holds_the_same_with_types(
 def test_persons_decision_is_in_force_beside_the_curators_scores(
     dataset: Dataset, decided: list[Episode], tmp_path: Path
 ) -> None:
-    override(dataset, decided[3].id, "keep", "fine", "Ada", "")
+    log_override(dataset, decided[3].id, "keep", "fine", "Ada")
     export(dataset, tmp_path / "all.csv", "csv")
     row = _rows(tmp_path / "all.csv")["pick-3"]
     assert (row["decision"], row["by"], row["reason"]) == ("keep", "Ada", "Ada: fine")

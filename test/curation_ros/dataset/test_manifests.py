@@ -18,8 +18,8 @@ from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.errors import BagError, ConfigError, CurationError
 from curation_ros.dataset.dataset import Dataset
+from curation_ros.dataset.decision_log import log_override
 from curation_ros.dataset.manifests import read_manifest, read_selected, save_selection
-from curation_ros.live.curator import override
 
 N = 8
 
@@ -81,8 +81,8 @@ def test_what_a_person_decided_is_what_is_selected(
     first, second = _recorded(dataset, rng, 2)
     _decide(dataset, first, {"knn": 1.0})
     _decide(dataset, second, {"knn": 2.0}, verdict="discard")
-    override(dataset, first.id, "discard", "", "Ada", "")
-    override(dataset, second.id, "keep", "", "Ada", "")
+    log_override(dataset, first.id, "discard", "", "Ada")
+    log_override(dataset, second.id, "keep", "", "Ada")
     _decide(dataset, second, {"knn": 3.0}, verdict="discard")
     assert _kept(dataset, rule="decisions") == [second.id]
     # Scores are the curator's, whatever a person decided: the last ones.
@@ -123,7 +123,7 @@ def test_fault_of_the_recording_is_not_selected_by_its_score(
     manifest, _ = save_selection(dataset, rule="top-k", value=1, scorer="knn")
     assert [e.episode for e in manifest.entries] == [second.id]
     assert manifest.abstained == (best.id,)
-    override(dataset, best.id, "keep", "", "Ada", "")
+    log_override(dataset, best.id, "keep", "", "Ada")
     assert _kept(dataset, rule="top-k", value=1, scorer="knn") == [best.id]
 
 

@@ -42,7 +42,7 @@ def test_graph_without_phases_says_so_and_warns_of_nothing() -> None:
     balance = balance_of([("a", None), ("b", None)])
     assert balance == Balance(2, 0, {})
     assert balance.warnings() == []
-    assert balance.describe() == "phases: not known: the topic map names none"
+    assert balance.describe() == "phases: unknown, because the topic map names none"
 
 
 def test_demonstrations_and_steps_add_up() -> None:
@@ -54,7 +54,7 @@ def test_demonstrations_and_steps_add_up() -> None:
     assert balance.phases["RELEASE"] == Shown(1, RELEASE)
     assert balance.describe() == (
         "phases shown by 3 demonstrations: PREGRASP 3, DESCEND 3, GRASP 3, LIFT 3, TRANSPORT 1, "
-        "RELEASE 1; of 1 others they are not known"
+        "RELEASE 1; unknown for 1 others"
     )
 
 

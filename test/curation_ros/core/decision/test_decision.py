@@ -50,7 +50,7 @@ def test_override_is_the_next_revision_on_the_same_evidence() -> None:
     after = override(before, "salvage", "dropped late", by="anna", span=(0, 4))
     assert (after.revision, after.verdict, after.span, after.by) == (2, "salvage", (0, 4), "anna")
     assert (after.scores, after.evidence) == (before.scores, before.evidence)
-    with pytest.raises(EpisodeError, match="no person"):
+    with pytest.raises(EpisodeError, match="expected the name of a person"):
         override(before, "keep", "r", by="curator")
 
 
@@ -80,9 +80,7 @@ def test_decision_survives_its_line(
         by="anna",
         state_hash="f00",
     )
-    line = before.to_line()
-    assert "\n" not in line
-    assert Decision.from_line(line) == before
+    line = json.dumps(before.to_json(), allow_nan=False)
     assert Decision.from_json(json.loads(line)) == before
 
 
@@ -111,12 +109,12 @@ def test_bad_line_is_refused(change: dict[str, object]) -> None:
         Decision.from_json(raw)
 
 
-def test_missing_key_and_broken_line_are_refused_and_unknown_keys_are_not() -> None:
+def test_missing_key_and_other_json_are_refused_and_unknown_keys_are_not() -> None:
     raw = decision().to_json()
     assert Decision.from_json({**raw, "written_at": "later"}) == decision()
     for key in raw:
         with pytest.raises(EpisodeError):
             Decision.from_json({k: v for k, v in raw.items() if k != key})
-    for line in ("", "{", "[]", "null", '{"episode": "e"'):
+    for other in ([], None, "keep", 3):
         with pytest.raises(EpisodeError):
-            Decision.from_line(line)
+            Decision.from_json(other)
