@@ -17,7 +17,12 @@ from curation_ros.cli.main import COMMANDS, parser
 from curation_ros.nodes.processes import NODE_MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "bags" / "README.md"]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    ROOT / "bags" / "README.md",
+]
 #: Most words of a sentence of prose, on average over a page.
 MEAN_WORDS = 20
 
@@ -115,8 +120,9 @@ def test_nodes_exist(page: Path) -> None:
     for code in code_of(page.read_text()):
         for node in re.findall(r"ros2 run curation_ros ([a-z]\w*)", code):
             assert node in NODE_MODULES, code
-        for node in re.findall(r"\.venv/bin/(\w+)", code):
-            assert node in {*NODE_MODULES, "curation", "python"}, code
+        for program in re.findall(r"\.venv/bin/([\w-]+)", code):
+            tools = {"curation", "python", "pytest", "pre-commit"}
+            assert program in {*NODE_MODULES, *tools}, code
 
 
 @pages
