@@ -19,6 +19,7 @@ class PolicyController:
 
     def __init__(self, policy: Policy) -> None:
         self.policy = policy
+        self._commanded = set(policy.commanded)
         self.reset()
 
     def reset(self) -> None:
@@ -56,7 +57,7 @@ class PolicyController:
 
     def _checked(self, command: Command) -> Command:
         policy = self.policy
-        if set(command) != set(policy.commanded):
+        if command.keys() != self._commanded:
             raise PolicyError(
                 f"policy {policy.card.id}: its command has {', '.join(command) or 'no field'}, "
                 f"expected {', '.join(policy.commanded)}"

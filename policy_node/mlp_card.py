@@ -8,12 +8,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from curation_ros.core.errors import ConfigError, PolicyError
-from policy_node.action import (
-    ActionSpec,
-    GripperCommand,
-    ScaledCommand,
-    action_from_json,
-)
+from policy_node.action import ActionSpec, action_from_json
+from policy_node.commands import GripperCommand, ScaledCommand
 from policy_node.observation import (
     ObservationSpec,
     observation_from_columns,

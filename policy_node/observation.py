@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -14,42 +13,20 @@ import numpy as np
 import numpy.typing as npt
 
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.episode.topic_map import AT_START, FieldSpec, TopicMap
+from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import PolicyError
 from curation_ros.core.types import Floats, Span
+from policy_node.observation_terms import (
+    LENGTHS,
+    ObservedField,
+    Operand,
+    Term,
+    make_term,
+    observed_field,
+    parse_operands,
+)
 
-_MINUS = " - "
-_COMMANDS = ("action", "gripper")
-#: How many of a unit are 1 m or 1 rad.
-_LENGTHS = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
-_PER_SI = {**_LENGTHS, "rad": 1.0, "deg": math.degrees(1.0)}
 _COLUMN = re.compile(r"(?P<term>.+)\[[0-9]+\]|(?P<phase>[^=]+)=(?P<label>.+)")
-
-
-@dataclass(frozen=True)
-class ObservedField:
-    """A field of the topic map as a policy was trained on it.
-
-    Attributes:
-        name: of the field.
-        width: number of values D.
-        unit: of the values.
-        labels: names of the phases where the field is a phase, else empty. A phase is one value,
-            the index of its name, and becomes a one-hot.
-    """
-
-    name: str
-    width: int
-    unit: str = ""
-    labels: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Operand:
-    """A field in a term: its value in each step, or its first value of the episode."""
-
-    name: str
-    is_at_start: bool
 
 
 @dataclass(frozen=True)
@@ -73,55 +50,34 @@ class ObservationSpec:
     def __post_init__(self) -> None:
         if not self.terms:
             raise PolicyError("an observation needs at least one term, found none")
-        named = dict.fromkeys(operand.name for term in self.terms for operand in operands(term))
-        if list(named) != [field.name for field in self.observed]:
-            found = ", ".join(field.name for field in self.observed) or "none"
+        wanted = _names(self.terms)
+        if wanted != list(self.fields):
             raise PolicyError(
-                f"the terms name {', '.join(named)}, the observed fields are {found}"
+                f"the terms name {', '.join(wanted)}, the observed fields are "
+                f"{', '.join(self.fields) or 'none'}"
             )
-        for term in self.terms:
-            self._check_term(term)
-
-    def _check_term(self, term: str) -> None:
-        parts = operands(term)
-        first = self._field(parts[0].name)
-        if first.width < 1:
-            raise PolicyError(f"observation {term!r}: field {first.name!r} has no values")
-        if any(self._field(part.name).labels for part in parts):
-            if len(parts) > 1 or parts[0].is_at_start or first.width != 1:
-                raise PolicyError(
-                    f"observation {term!r}: a phase has one value and stands alone, without "
-                    f"{AT_START} and differences"
-                )
-            return
-        for part in parts[1:]:
-            other = self._field(part.name)
-            if (other.width, _unit(other.unit)) != (first.width, _unit(first.unit)):
-                raise PolicyError(
-                    f"observation {term!r}: {first.name!r} has {first.width} values in "
-                    f"{first.unit!r}, {other.name!r} has {other.width} in {other.unit!r}; a "
-                    "difference needs equal units and widths"
-                )
+        _ = self._layout  # checks each term
 
     @cached_property
     def _by_name(self) -> dict[str, ObservedField]:
         return {field.name: field for field in self.observed}
 
-    def _field(self, name: str) -> ObservedField:
-        return self._by_name[name]
+    @cached_property
+    def _layout(self) -> tuple[tuple[Term, slice], ...]:
+        """Each term, and the columns that it fills."""
+        terms = [make_term(text, self._by_name) for text in self.terms]
+        ends = itertools.accumulate((len(term.columns) for term in terms), initial=0)
+        return tuple(zip(terms, itertools.starmap(slice, itertools.pairwise(ends)), strict=True))
+
+    @cached_property
+    def _labels(self) -> dict[str, npt.NDArray[np.int_]]:
+        """Indices of the phases of each field that is one."""
+        return {f.name: np.arange(len(f.labels)) for f in self.observed if f.labels}
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
         """Name of every column, such as `eef_position[0]` or `phase=LIFT`."""
-        names: list[str] = []
-        for term in self.terms:
-            field = self._field(operands(term)[0].name)
-            shown = f"({term})" if _MINUS in term else term
-            if field.labels:
-                names += [f"{term}={label}" for label in field.labels]
-            else:
-                names += [f"{shown}[{k}]" for k in range(field.width)]
-        return tuple(names)
+        return tuple(name for term, _ in self._layout for name in term.columns)
 
     @property
     def width(self) -> int:
@@ -136,31 +92,31 @@ class ObservationSpec:
     @cached_property
     def start_fields(self) -> tuple[str, ...]:
         """Those of `fields` whose first value of the episode is needed."""
-        return self._named(at_start=True)
+        return tuple(dict.fromkeys(o.name for o in self._operands if o.is_at_start))
 
     @cached_property
     def step_fields(self) -> tuple[str, ...]:
         """Those of `fields` whose value in every step is needed."""
-        return self._named(at_start=False)
+        return tuple(dict.fromkeys(o.name for o in self._operands if not o.is_at_start))
 
-    def _named(self, *, at_start: bool) -> tuple[str, ...]:
-        parts = itertools.chain.from_iterable(map(operands, self.terms))
-        return tuple(dict.fromkeys(p.name for p in parts if p.is_at_start == at_start))
+    @property
+    def _operands(self) -> Iterable[Operand]:
+        return (operand for term, _ in self._layout for operand in term.operands)
 
     @cached_property
     def is_one_hot(self) -> npt.NDArray[np.bool_]:
         """(D,) bool: columns of a one-hot, which are not standardised."""
         mask = np.zeros(self.width, dtype=bool)
-        for parts, place in self._layout:
-            mask[place] = bool(self._field(parts[0].name).labels)
+        for term, place in self._layout:
+            mask[place] = term.is_one_hot
         return mask
 
     @cached_property
     def per_si(self) -> Floats:
         """(D,) how many of a column's unit are 1 m or 1 rad; 1 for any other unit."""
         factors = np.ones(self.width)
-        for parts, place in self._layout:
-            factors[place] = _PER_SI.get(self._field(parts[0].name).unit, 1.0)
+        for term, place in self._layout:
+            factors[place] = term.field.per_si
         return factors
 
     @cached_property
@@ -170,41 +126,20 @@ class ObservationSpec:
         S counts the values of all `start_fields` that are lengths, in their order. Other values
         at the start, such as angles, have no row.
         """
-        lengths = [self._field(name) for name in self.start_fields]
-        lengths = [field for field in lengths if field.unit in _LENGTHS]
-        first_rows = dict(
-            zip(
-                (field.name for field in lengths),
-                itertools.accumulate((field.width for field in lengths), initial=0),
-                strict=False,
-            )
-        )
-        effect = np.zeros((sum(field.width for field in lengths), self.width))
-        for parts, place in self._layout:
-            for k, part in enumerate(parts):
-                if part.is_at_start and part.name in first_rows:
-                    field, row = self._field(part.name), first_rows[part.name]
-                    per_m = _LENGTHS[field.unit] * (-1.0 if k else 1.0)
+        rows: dict[str, int] = {}
+        n_rows = 0
+        for name in self.start_fields:
+            if self._by_name[name].unit in LENGTHS:
+                rows[name] = n_rows
+                n_rows += self._by_name[name].width
+        effect = np.zeros((n_rows, self.width))
+        for term, place in self._layout:
+            for k, operand in enumerate(term.operands):
+                if operand.is_at_start and operand.name in rows:
+                    field, row = self._by_name[operand.name], rows[operand.name]
+                    per_m = LENGTHS[field.unit] * (-1.0 if k else 1.0)
                     effect[row : row + field.width, place] = per_m * np.eye(field.width)
         return effect
-
-    @cached_property
-    def _layout(self) -> tuple[tuple[tuple[Operand, ...], slice], ...]:
-        """Operands of each term, and the columns that it fills."""
-        places: list[tuple[tuple[Operand, ...], slice]] = []
-        first = 0
-        for term in self.terms:
-            parts = operands(term)
-            field = self._field(parts[0].name)
-            width = len(field.labels) or field.width
-            places.append((parts, slice(first, first + width)))
-            first += width
-        return tuple(places)
-
-    @cached_property
-    def _labels(self) -> dict[str, npt.NDArray[np.int_]]:
-        """Indices of the phases of each field that is one."""
-        return {f.name: np.arange(len(f.labels)) for f in self.observed if f.labels}
 
     def check(self, topic_map: TopicMap, where: str) -> None:
         """Refuse a topic map that cannot give these observations.
@@ -216,23 +151,8 @@ class ObservationSpec:
         Raises:
             PolicyError: if a field is missing or has another width, unit or other phases.
         """
-        for wanted in self.observed:
-            found = _field_of(topic_map, wanted.name, where)
-            if found.labels != wanted.labels:
-                raise PolicyError(
-                    f"{where}: the topic map's phases are {', '.join(found.labels) or 'none'}, "
-                    f"expected {', '.join(wanted.labels) or 'none'}"
-                )
-            if len(found.values) != wanted.width:
-                raise PolicyError(
-                    f"{where}: field {wanted.name!r} of the topic map has {len(found.values)} "
-                    f"values, expected {wanted.width}"
-                )
-            if not wanted.labels and _unit(found.unit) != _unit(wanted.unit):
-                raise PolicyError(
-                    f"{where}: field {wanted.name!r} of the topic map is in {found.unit!r}, "
-                    f"expected {wanted.unit!r}"
-                )
+        for field in self.observed:
+            field.check(topic_map, where)
 
     def from_episode(self, episode: Episode, span: Span | None = None) -> Floats:
         """Observations of the steps of an episode.
@@ -288,7 +208,7 @@ class ObservationSpec:
         if name not in values:
             raise PolicyError(f"{where}: no field {name!r}; it has {', '.join(values) or 'none'}")
         row: Floats = np.asarray(values[name], dtype=np.float64)
-        width = self._field(name).width
+        width = self._by_name[name].width
         if row.shape != (width,):
             raise PolicyError(
                 f"{where}: field {name!r} has shape {row.shape}, expected ({width},)"
@@ -299,22 +219,22 @@ class ObservationSpec:
         self, values: Mapping[str, Floats], start: Mapping[str, Floats], n_steps: int, where: str
     ) -> Floats:
         out = np.empty((n_steps, self.width))
-        for parts, place in self._layout:
-            first, *others = parts
-            if first.name in self._labels:
-                phases = self._labels[first.name]
-                out[:, place] = is_phase = values[first.name] == phases
+        for term, place in self._layout:
+            first, *others = term.operands
+            if term.is_one_hot:
+                phase = values[first.name]
+                out[:, place] = is_phase = phase == self._labels[first.name]
                 if not is_phase.any(axis=1).all():
                     row = int(np.argmin(is_phase.any(axis=1)))
                     raise PolicyError(
-                        f"{where}: phase index {values[first.name][row, 0]} in row {row}, "
-                        f"expected 0 to {len(phases) - 1}"
+                        f"{where}: phase index {phase[row, 0]} in row {row}, "
+                        f"expected 0 to {len(term.field.labels) - 1}"
                     )
                 continue
-            term = (start if first.is_at_start else values)[first.name]
+            result = (start if first.is_at_start else values)[first.name]
             for other in others:
-                term = term - (start if other.is_at_start else values)[other.name]
-            out[:, place] = term
+                result = result - (start if other.is_at_start else values)[other.name]
+            out[:, place] = result
         if not np.isfinite(out).all():
             row, column = np.argwhere(~np.isfinite(out))[0]
             raise PolicyError(
@@ -325,13 +245,7 @@ class ObservationSpec:
 
     def to_json(self) -> dict[str, Any]:
         """Plain data that `observation_from_json` reads back to an equal spec."""
-        return {
-            "terms": list(self.terms),
-            "fields": [
-                {"name": f.name, "width": f.width, "unit": f.unit, "labels": list(f.labels)}
-                for f in self.observed
-            ],
-        }
+        return {"terms": list(self.terms), "fields": [asdict(field) for field in self.observed]}
 
 
 def observation_spec(terms: Sequence[str], topic_map: TopicMap, where: str) -> ObservationSpec:
@@ -346,16 +260,7 @@ def observation_spec(terms: Sequence[str], topic_map: TopicMap, where: str) -> O
         PolicyError: if a term names no field, names a command, or a difference has operands of
             different widths or units.
     """
-    names = dict.fromkeys(operand.name for term in terms for operand in operands(term))
-    observed = []
-    for name in names:
-        spec = _field_of(topic_map, name, where)
-        if spec.role in _COMMANDS:
-            raise PolicyError(
-                f"{where}: field {name!r} has role {spec.role}: a policy gives commands and "
-                "cannot observe them"
-            )
-        observed.append(ObservedField(name, len(spec.values), spec.unit, spec.labels))
+    observed = [observed_field(topic_map, name, where) for name in _names(terms)]
     try:
         return ObservationSpec(tuple(terms), tuple(observed))
     except PolicyError as err:
@@ -413,7 +318,7 @@ def observation_from_columns(columns: Sequence[str], unit: str, where: str) -> O
         counts[term] = counts.get(term, 0) + 1
     observed: dict[str, ObservedField] = {}
     for term, width in counts.items():
-        for operand in operands(term):
+        for operand in parse_operands(term):
             phases = tuple(labels.get(operand.name, ()))
             field = ObservedField(
                 operand.name, 1 if phases else width, "" if phases else unit, phases
@@ -430,22 +335,6 @@ def observation_from_columns(columns: Sequence[str], unit: str, where: str) -> O
     return spec
 
 
-def operands(term: str) -> tuple[Operand, ...]:
-    """Fields of a term, the first one minus the others."""
-    parts = (text.strip() for text in term.split(_MINUS))
-    return tuple(Operand(text.removesuffix(AT_START), text.endswith(AT_START)) for text in parts)
-
-
-def _field_of(topic_map: TopicMap, name: str, where: str) -> FieldSpec:
-    spec = topic_map.fields.get(name)
-    if spec is None:
-        raise PolicyError(
-            f"{where}: the topic map has no field {name!r}; it has "
-            f"{', '.join(topic_map.fields) or 'none'}"
-        )
-    return spec
-
-
-def _unit(unit: str) -> str:
-    """Topic maps write no unit as an empty text or as 1."""
-    return unit or "1"
+def _names(terms: Iterable[str]) -> list[str]:
+    """Fields that terms name, each once, in their order."""
+    return list(dict.fromkeys(o.name for text in terms for o in parse_operands(text)))

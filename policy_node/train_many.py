@@ -221,9 +221,7 @@ def _fit(
     """
     widths = learners[0].widths
     n = len(learners)
-    parameters, gradients, first_moments, second_moments = (
-        torch.zeros(n, _stack_size(widths)) for _ in range(4)
-    )
+    parameters, gradients, *moments = (torch.zeros(n, _stack_size(widths)) for _ in range(4))
     layers = [_layers(*pair, widths) for pair in zip(parameters, gradients, strict=True)]
     for learner, own in zip(learners, layers, strict=True):
         for linear, layer in zip(linear_layers(learner.network), own, strict=True):
@@ -245,23 +243,7 @@ def _fit(
                 data = learners[k].data
                 buffers.gather(rows[id(data)], *batches[k][step], data.jitter)
                 buffers.backpropagate(layers[k], errors[step, k])
-            # The function, not the class: that loads torch._dynamo, which takes seconds.
-            adam(
-                [parameters],
-                [gradients],
-                [first_moments],
-                [second_moments],
-                [],
-                [step_count],
-                fused=True,
-                amsgrad=False,
-                beta1=0.9,
-                beta2=0.999,
-                lr=settings.lr,
-                weight_decay=settings.weight_decay,
-                eps=1e-8,
-                maximize=False,
-            )
+            _update(parameters, gradients, moments, step_count, settings)
         losses = errors[:n_steps].square().mean((2, 3)).T.tolist()
         for k in learning:
             learner = learners[k]
@@ -272,6 +254,34 @@ def _fit(
         for linear, layer in zip(linear_layers(learner.network), own, strict=True):
             linear.weight.copy_(layer.weight)
             linear.bias.copy_(layer.bias)
+
+
+def _update(
+    parameters: torch.Tensor,
+    gradients: torch.Tensor,
+    moments: Sequence[torch.Tensor],
+    step_count: torch.Tensor,
+    settings: TrainingSettings,
+) -> None:
+    """One step of Adam for all policies."""
+    first, second = moments
+    # The function, not the class: that loads torch._dynamo, which takes seconds.
+    adam(
+        [parameters],
+        [gradients],
+        [first],
+        [second],
+        [],
+        [step_count],
+        fused=True,
+        amsgrad=False,
+        beta1=0.9,
+        beta2=0.999,
+        lr=settings.lr,
+        weight_decay=settings.weight_decay,
+        eps=1e-8,
+        maximize=False,
+    )
 
 
 class _Buffers:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -13,6 +15,9 @@ from curation_ros.cli.output import print_json, progress_console, say, warn
 from curation_ros.configuration import share_file
 from curation_ros.core.errors import CurationError
 from curation_ros.files import named_errors, write_atomically
+
+if TYPE_CHECKING:
+    from curation_ros.study.running import Study
 
 _DONE, _NOTHING = 0, 3
 #: Problems that are shown; `results.json` has all of them.
@@ -84,17 +89,7 @@ def run(args: argparse.Namespace) -> int:
             stages=args.stage,
         )
     if args.dry_run:
-        wanted = {policy for cell in study.cells for policy in cell.policies.values()}
-        trained = {row["policy"] for row in study.trials.rows("policy") if row["status"] == "ok"}
-        rolled = sum(row["status"] == "ok" for row in study.trials.rows("rollout"))
-        if args.json:
-            print_json(
-                {"policies": len(wanted), "trained": len(wanted & trained), "rollouts": rolled}
-            )
-        else:
-            say(
-                f"{len(wanted & trained)} of {len(wanted)} policies and {rolled} rollouts are done"
-            )
+        _print_progress(study, args.json)
         return _DONE
     found = results(study)
     path = folder / "results.json"
@@ -104,28 +99,45 @@ def run(args: argparse.Namespace) -> int:
         from curation_ros.reporting import write_report
 
         written += write_report(found, folder)
+    _print_results(found, written, args.json)
+    return _DONE if found["budget"]["rollouts"] else _NOTHING
+
+
+def _print_progress(study: Study, is_json: bool) -> None:
+    """How much of a study is done."""
+    wanted = {policy for cell in study.cells for policy in cell.policies.values()}
+    trained = {row["policy"] for row in study.trials.rows("policy") if row["status"] == "ok"}
+    rolled = sum(row["status"] == "ok" for row in study.trials.rows("rollout"))
+    if is_json:
+        print_json({"policies": len(wanted), "trained": len(wanted & trained), "rollouts": rolled})
+    else:
+        say(f"{len(wanted & trained)} of {len(wanted)} policies and {rolled} rollouts are done")
+
+
+def _print_results(found: Mapping[str, Any], written: Sequence[Path], is_json: bool) -> None:
+    """The files of a study, the results first, and its problems."""
     missing = sum(stage["missing"] for stage in found["stages"])
-    if args.json:
+    problems = found["problems"]
+    if is_json:
         print_json(
             {
-                "results": str(path),
-                "written": [str(p) for p in written],
+                "results": str(written[0]),
+                "written": [str(path) for path in written],
                 "rollouts": found["budget"]["rollouts"],
                 "missing": missing,
                 "steps": found["budget"]["used_steps"],
-                "problems": list(study.problems),
+                "problems": problems,
             }
         )
-    else:
-        for problem in study.problems[:_SHOWN]:
-            warn(problem)
-        if len(study.problems) > _SHOWN:
-            warn(f"and {len(study.problems) - _SHOWN} more, see {path}")
-        if missing:
-            warn(f"{missing} rollouts are missing; run the same command again to try them")
-        for one in written:
-            say(str(one))
-    return _DONE if found["budget"]["rollouts"] else _NOTHING
+        return
+    for problem in problems[:_SHOWN]:
+        warn(problem)
+    if len(problems) > _SHOWN:
+        warn(f"and {len(problems) - _SHOWN} more, see {written[0]}")
+    if missing:
+        warn(f"{missing} rollouts are missing; run the same command again to try them")
+    for path in written:
+        say(str(path))
 
 
 def _check_report() -> None:

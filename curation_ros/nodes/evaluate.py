@@ -49,6 +49,16 @@ def evaluate_on_graph(
             these is a failure of the policy.
     """
     n = count_starts(starts)
+    settings = {
+        "mode": "command",
+        "episodes": n,
+        "starts": starts,
+        "task": "rollout",
+        **({} if max_steps is None else {"max_steps": max_steps}),
+        "steps_after_success": 0,
+        "command_timeout_s": _ANSWER_S,
+        "wait_for": ["policy_node"],
+    }
     domain = Domain()
     with (
         tempfile.TemporaryDirectory(prefix="curation_ros-evaluate-") as folder,
@@ -57,37 +67,24 @@ def evaluate_on_graph(
         truth_log = Dataset(folder, create=True).truth_log
         try:
             nodes.start("policy_node", {"policy": policy})
-            nodes.start(
-                "sim_node",
-                {
-                    "mode": "command",
-                    "episodes": n,
-                    "starts": starts,
-                    "task": "rollout",
-                    **({} if max_steps is None else {"max_steps": max_steps}),
-                    "steps_after_success": 0,
-                    "command_timeout_s": _ANSWER_S,
-                    "dataset": folder,
-                    "wait_for": ["policy_node"],
-                },
-            )
+            nodes.start("sim_node", {**settings, "dataset": folder})
             n_done, last_s = 0, time.monotonic()
             while n_done < n and not (stop is not None and stop.is_set()):
-                ended = nodes.ended("sim_node") is not None
+                has_ended = nodes.ended("sim_node") is not None
                 _check_nodes(nodes, log_folder)
                 lines = truth_log.lines()
                 for line in lines[n_done:]:
                     yield _row(policy_id, line)
                 if len(lines) > n_done:
                     n_done, last_s = len(lines), time.monotonic()
-                elif ended:
+                    continue
+                if has_ended:
                     raise CurationError(f"sim_node ended after {n_done} of {n} rollouts")
-                elif time.monotonic() - last_s > _SILENCE_S:
+                if time.monotonic() - last_s > _SILENCE_S:
                     raise CurationError(
                         f"no rollout has ended for {_SILENCE_S:g} s: see {log_folder}/sim_node.log"
                     )
-                else:
-                    time.sleep(0.1)
+                time.sleep(0.1)
         finally:
             domain.close()
 

@@ -7,14 +7,8 @@ import pytest
 from demonstrations import PERIOD_NS, RELATIVE, TOPIC_MAP, demonstration
 
 from curation_ros.core.errors import PolicyError
-from policy_node.action import (
-    ActionSpec,
-    CommandTerm,
-    GripperCommand,
-    ScaledCommand,
-    action_from_json,
-    action_spec,
-)
+from policy_node.action import ActionSpec, CommandTerm, action_from_json, action_spec
+from policy_node.commands import GripperCommand, ScaledCommand
 
 
 def with_commands(episode, **fields):

@@ -16,11 +16,11 @@ from demonstrations import (
 from curation_ros.core.errors import PolicyError
 from policy_node.observation import (
     ObservationSpec,
-    ObservedField,
     observation_from_columns,
     observation_from_json,
     observation_spec,
 )
+from policy_node.observation_terms import ObservedField
 
 variants = pytest.mark.parametrize("variant", VARIANTS)
 
