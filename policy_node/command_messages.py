@@ -6,16 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from curation_ros.bags.cdr_encoding import encode
+import numpy as np
+
 from curation_ros.bags.cdr_paths import Keyed, Named, ValuePath, resolve_path
-from curation_ros.bags.definitions import PRIMITIVES, Definitions, parse_definition
+from curation_ros.bags.definitions import PRIMITIVES, TEXTS, Definitions, Field, parse_definition
 from curation_ros.bags.schemas import message_schema
+from curation_ros.core.episode import messages
+from curation_ros.core.episode.messages import PlainMessage
 from curation_ros.core.episode.topic_map import FieldSpec, TopicMap
-from curation_ros.core.errors import ConfigError
-from curation_ros.core.types import NS_PER_S, Floats
+from curation_ros.core.errors import ConfigError, EpisodeError
 from policy_node.policy import Command
 
 _HEADER = "std_msgs/msg/Header"
+_FLOATS = ("float32", "float64")
+#: Unsigned in ROS 2.
+_BYTES = ("byte", "char")
 
 
 @dataclass(frozen=True)
@@ -63,7 +68,7 @@ class CommandMessages:
                 raise ConfigError(f"command {spec.name!r}: {topic.type} has a text there")
         self.topics = {topic.name: topic.type for topic in self._topics.values()}
 
-    def encode(self, command: Command, stamp_ns: int) -> list[tuple[str, bytes]]:
+    def messages(self, command: Command, stamp_ns: int) -> list[PlainMessage]:
         """The messages of a command.
 
         Args:
@@ -71,27 +76,25 @@ class CommandMessages:
             stamp_ns: of the observation that it answers.
 
         Returns:
-            (topic, CDR bytes) of each topic, in the order of the map.
+            One message per topic, in the order of the map.
 
         Raises:
             EpisodeError: if a value does not fit its message, such as 300 in an int8.
         """
         return [
-            (topic.name, self._message(topic, command, stamp_ns))
+            PlainMessage(topic.name, topic.type, self._content(topic, command, stamp_ns))
             for topic in self._topics.values()
         ]
 
-    def _message(self, topic: _Topic, command: Mapping[str, Floats], stamp_ns: int) -> bytes:
-        message: dict[str, Any] = {}
-        first = topic.definitions[topic.type][:1]
-        if first and first[0].base == _HEADER:
-            sec, nanosec = divmod(stamp_ns, NS_PER_S)
-            stamp = {"sec": sec, "nanosec": nanosec}
-            message[first[0].name] = {"stamp": stamp, "frame_id": self._frame}
+    def _content(self, topic: _Topic, command: Command, stamp_ns: int) -> Mapping[str, Any]:
+        content = _zeros(topic.definitions, topic.type)
+        first = topic.definitions[topic.type][0]
+        if first.base == _HEADER:
+            content[first.name] = {"stamp": messages.time(stamp_ns), "frame_id": self._frame}
         for name, paths in topic.paths.items():
             for path, value in zip(paths, command[name], strict=True):
-                _put(message, topic, path, float(value))
-        return encode(topic.type, topic.definitions, message)
+                _put(content, topic, path, float(value))
+        return content
 
 
 def _topic_of(spec: FieldSpec) -> _Topic:
@@ -100,60 +103,87 @@ def _topic_of(spec: FieldSpec) -> _Topic:
     return _Topic(spec.topic, spec.type, definitions)
 
 
-def _put(message: dict[str, Any], topic: _Topic, path: ValuePath, value: float) -> None:
+def _zeros(definitions: Definitions, type_name: str) -> dict[str, Any]:
+    """A message with every number zero, every text empty, and every list as short as it may be."""
+    return {member.name: _zero(definitions, member) for member in definitions[type_name]}
+
+
+def _zero(definitions: Definitions, member: Field) -> Any:
+    if member.kind == "one":
+        return _zero_element(definitions, member)
+    n = member.size if member.kind == "array" else 0
+    return [_zero_element(definitions, member) for _ in range(n)]
+
+
+def _zero_element(definitions: Definitions, member: Field) -> Any:
+    if member.is_struct:
+        return _zeros(definitions, member.base)
+    return "" if member.base in TEXTS else _number(member.base, 0.0, member.name)
+
+
+def _put(content: dict[str, Any], topic: _Topic, path: ValuePath, value: float) -> None:
     """Put one value at its path, and make all that leads to it."""
-    owner, at = topic.type, message
+    owner, at = topic.type, content
     steps = list(path.steps)
     while steps:
         member = next(f for f in topic.definitions[owner] if f.name == steps[0])
         name = str(steps.pop(0))
         if member.kind == "one":
             if not steps:
-                at[name] = _number(member.base, value)
+                at[name] = _number(member.base, value, path.text)
                 return
-            at, owner = at.setdefault(name, {}), member.base
+            at, owner = at[name], member.base
             continue
-        elements = at.setdefault(name, [])
         step = steps.pop(0)
         if isinstance(step, Named):
-            _put_named(at, topic.definitions, owner, name, step, value)
+            _put_named(at, topic.definitions[owner], member, step, value)
             return
         if isinstance(step, Keyed):
-            number = _number(_base(topic.definitions, member.base, "value"), value)
-            elements.append({"key": step.wanted, "value": number})
+            of_value = next(f for f in topic.definitions[member.base] if f.name == "value")
+            number = _number(of_value.base, value, path.text)
+            at[name].append({**_zeros(topic.definitions, member.base), "key": step.wanted})
+            at[name][-1]["value"] = number
             return
-        wanted = member.size if member.kind == "array" else int(step) + 1
-        while len(elements) < wanted:
-            elements.append({} if member.is_struct else 0)
+        elements = at[name]
+        elements += [
+            _zero_element(topic.definitions, member) for _ in range(int(step) + 1 - len(elements))
+        ]
         if not steps:
-            elements[int(step)] = _number(member.base, value)
+            elements[int(step)] = _number(member.base, value, path.text)
             return
         at, owner = elements[int(step)], member.base
 
 
 def _put_named(
     at: dict[str, Any],
-    definitions: Definitions,
-    owner: str,
-    member: str,
+    members: tuple[Field, ...],
+    member: Field,
     named: Named,
     value: float,
 ) -> None:
     """Put a value beside its name; all lists of numbers there have one element per name."""
-    names = at.setdefault(named.names, [])
+    names = at[named.names]
     if named.wanted not in names:
         names.append(named.wanted)
-    for beside in definitions[owner]:
+    for beside in members:
         if beside.kind == "sequence" and beside.base in PRIMITIVES:
-            numbers = at.setdefault(beside.name, [])
-            numbers += [0] * (len(names) - len(numbers))
-    at[member][names.index(named.wanted)] = _number(_base(definitions, owner, member), value)
+            zero = _number(beside.base, 0.0, beside.name)
+            at[beside.name] += [zero] * (len(names) - len(at[beside.name]))
+    at[member.name][names.index(named.wanted)] = _number(member.base, value, named.wanted)
 
 
-def _base(definitions: Definitions, owner: str, member: str) -> str:
-    return next(f.base for f in definitions[owner] if f.name == member)
+def _number(base: str, value: float, where: str) -> float | int | bool:
+    """The nearest number of a type: integers are rounded.
 
-
-def _number(base: str, value: float) -> float | int:
-    """The nearest number of a type: integers are rounded."""
-    return value if base in ("float32", "float64") else round(value)
+    Raises:
+        EpisodeError: if it is out of the range of the type.
+    """
+    if base in _FLOATS:
+        return value
+    if base == "bool":
+        return bool(round(value))
+    limits = np.iinfo("uint8" if base in _BYTES else base)
+    number = round(value)
+    if not limits.min <= number <= limits.max:
+        raise EpisodeError(f"command {where!r}: {number} is out of the range of {base}")
+    return number

@@ -14,7 +14,7 @@ from curation_ros.core.episode.status import event_from_status
 from curation_ros.core.episode.stream import Sample
 from curation_ros.core.errors import ConfigError, CurationError
 from curation_ros.nodes.health import Health
-from curation_ros.nodes.messages import message_type, single_from_ros
+from curation_ros.nodes.messages import message_type, single_from_ros, to_ros
 from curation_ros.nodes.parameters import Parameter, declare
 from curation_ros.nodes.qos import LATCHED, MAPPED
 from curation_ros.nodes.spinning import WorkingNode, run
@@ -83,8 +83,9 @@ class PolicyNode(WorkingNode):
         problem = self._live.problem
         for answer in answers:
             try:
-                for topic, data in self._messages.encode(answer.command, answer.stamp_ns):
-                    self._outputs[topic].publish(data)
+                for message in self._messages.messages(answer.command, answer.stamp_ns):
+                    ros_message = to_ros(message.type, message.content)
+                    self._outputs[message.topic].publish(ros_message)
             except CurationError as err:
                 problem = str(err)
         if problem != self._logged:

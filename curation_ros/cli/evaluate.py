@@ -15,6 +15,7 @@ from curation_ros.cli.output import percent, print_json, progress_console, say
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.errors import ConfigError
 from curation_ros.nodes.evaluate import evaluate_on_graph, summary
+from sim_node.settings import MAX_STEPS
 
 _MOST_STEPS = 100_000  # the limit of sim_node
 
@@ -26,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--starts", default="official:0:50", help="official:FIRST:END or generated:SEED:COUNT"
     )
     parser.add_argument(
-        "--max-steps", type=int, help="then a rollout has failed; default: that of sim_node"
+        "--max-steps", type=int, default=MAX_STEPS, help="then a rollout has failed"
     )
     parser.add_argument(
         "--graph", action="store_true", help="drive sim_node and policy_node over ROS 2"
@@ -39,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     """Print a row per rollout, then the summary."""
     from policy_node.policy import load_policy
 
-    if args.max_steps is not None and not 1 <= args.max_steps <= _MOST_STEPS:
+    if not 1 <= args.max_steps <= _MOST_STEPS:
         raise ConfigError(f"--max-steps {args.max_steps}: expected 1 to {_MOST_STEPS}")
     policy = load_policy(args.policy)
     policy.check(topic_map_or_default(""))

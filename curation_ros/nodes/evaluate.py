@@ -49,16 +49,7 @@ def evaluate_on_graph(
             these is a failure of the policy.
     """
     n = count_starts(starts)
-    settings = {
-        "mode": "command",
-        "episodes": n,
-        "starts": starts,
-        "task": "rollout",
-        **({} if max_steps is None else {"max_steps": max_steps}),
-        "steps_after_success": 0,
-        "command_timeout_s": _ANSWER_S,
-        "wait_for": ["policy_node"],
-    }
+    settings = _sim_settings(starts, n, max_steps)
     domain = Domain()
     with (
         tempfile.TemporaryDirectory(prefix="curation_ros-evaluate-") as folder,
@@ -80,13 +71,24 @@ def evaluate_on_graph(
                     continue
                 if has_ended:
                     raise CurationError(f"sim_node ended after {n_done} of {n} rollouts")
-                if time.monotonic() - last_s > _SILENCE_S:
-                    raise CurationError(
-                        f"no rollout has ended for {_SILENCE_S:g} s: see {log_folder}/sim_node.log"
-                    )
+                _check_silence(time.monotonic() - last_s, log_folder)
                 time.sleep(0.1)
         finally:
             domain.close()
+
+
+def _sim_settings(starts: str, n: int, max_steps: int | None) -> dict[str, Any]:
+    """Parameters of sim_node for rollouts of a policy, apart from the dataset."""
+    return {
+        "mode": "command",
+        "episodes": n,
+        "starts": starts,
+        "task": "rollout",
+        **({} if max_steps is None else {"max_steps": max_steps}),
+        "steps_after_success": 0,
+        "command_timeout_s": _ANSWER_S,
+        "wait_for": ["policy_node"],
+    }
 
 
 def _check_nodes(nodes: Nodes, log_folder: Path) -> None:
@@ -100,6 +102,14 @@ def _check_nodes(nodes: Nodes, log_folder: Path) -> None:
         if code == 0 and node == "policy_node":
             raise CurationError(f"{node} was stopped by somebody else: its log is {log}")
     nodes.check()
+
+
+def _check_silence(silence_s: float, log_folder: Path) -> None:
+    """Raise if no rollout has ended for too long."""
+    if silence_s > _SILENCE_S:
+        raise CurationError(
+            f"no rollout has ended for {_SILENCE_S:g} s: see {log_folder}/sim_node.log"
+        )
 
 
 def count_starts(spec: str) -> int:

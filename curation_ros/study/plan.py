@@ -15,6 +15,7 @@ from curation_ros.core.scorers import SCORERS, find_scorer, is_scorer
 from curation_ros.core.yaml_file import read_yaml
 from curation_ros.study.terms import Term, parse_row
 from policy_node.settings import DEFAULTS
+from sim_node.settings import MAX_STEPS
 
 #: What a stage is for. Results of `screen` are for exploring; nothing is claimed from them.
 KINDS = ("protocol", "screen", "confirm")
@@ -113,7 +114,7 @@ class StudyPlan:
     pools: Mapping[str, Mapping[str, Any]]
     stages: tuple[Stage, ...]
     budget_steps: int = 4_000_000
-    max_steps: int = 500
+    max_steps: int = MAX_STEPS
     gives_up: bool = True
     gradient_steps: int = DEFAULTS.steps
     length: str = "shortest-reference"

@@ -130,30 +130,22 @@ def run_study(
         datasets, fact["units"] = collect_datasets(data, plan, jobs=jobs, backend=backend, log=log)
     reference = read_all_episodes(datasets["reference"], "reference")
     pools = _score_pools(plan, datasets, reference, clock, log)
-    trials = PolicyTrials(
-        folder,
-        jobs=jobs,
-        backend=backend,
-        max_steps=plan.max_steps,
-        gives_up=plan.gives_up,
-        budget_steps=plan.budget_steps,
-    )
+    trials = _trials(plan, folder, jobs, backend)
     cells = tuple(_cells(plan, pools, datasets["reference"], datasets.get("more")))
     log(
         f"{len(cells)} cells, {len({p for c in cells for p in c.policies.values()})} policies; "
         f"{trials.used_steps} of {plan.budget_steps} simulation steps are used"
     )
-    found: list[str] = []
+    problems: list[str] = []
     for label, part in _parts(cells) if work else ():
-        found += _train(trials, plan, part, label, clock, log, ticks)
-        found += _roll(trials, part, label, clock, log, ticks)
+        problems += _train_and_roll(trials, plan, label, part, clock, log, ticks)
     return Study(
         plan=plan,
         trials=trials,
         pools=pools,
         reference=datasets["reference"],
         cells=cells,
-        problems=tuple(dict.fromkeys(found)),
+        problems=tuple(dict.fromkeys(problems)),
         seconds=tuple(clock.all()),
         n_reference=len(reference),
         timelines=_timelines(datasets, reference, pools),
@@ -213,6 +205,31 @@ def _parts(cells: tuple[Cell, ...]) -> Iterator[tuple[str, list[Cell]]]:
     for (stage, pool, variant), alike in parts.items():
         for k in range(0, len(alike), _CELLS):
             yield f"{stage}: {pool}, {variant}", alike[k : k + _CELLS]
+
+
+def _trials(plan: StudyPlan, folder: Path, jobs: int, backend: str) -> PolicyTrials:
+    return PolicyTrials(
+        folder,
+        jobs=jobs,
+        backend=backend,
+        max_steps=plan.max_steps,
+        gives_up=plan.gives_up,
+        budget_steps=plan.budget_steps,
+    )
+
+
+def _train_and_roll(
+    trials: PolicyTrials,
+    plan: StudyPlan,
+    label: str,
+    cells: list[Cell],
+    clock: _Clock,
+    log: Log,
+    ticks: Ticks,
+) -> list[str]:
+    """Do a part of a study; returns a line for each unit that failed or was not begun."""
+    problems = _train(trials, plan, cells, label, clock, log, ticks)
+    return problems + _roll(trials, cells, label, clock, log, ticks)
 
 
 def _train(

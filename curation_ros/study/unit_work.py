@@ -15,7 +15,7 @@ from policy_node.mlp import MlpPolicy
 from policy_node.policy import load_policy
 from policy_node.rollouts import Rollout, rollout
 from policy_node.settings import TrainingSettings
-from sim_node.settings import MAX_STEPS, SIMULATED_TASK
+from sim_node.settings import SIMULATED_TASK
 from sim_node.tasks import process_environment, task_named
 
 
@@ -24,21 +24,20 @@ def policy_folder(study: Path, policy_id: str) -> Path:
     return study / "policies" / policy_id
 
 
-def roll_policy(policy: Path, start: str, max_steps: int | None) -> Rollout:
+def roll_policy(policy: Path, start: str, max_steps: int) -> Rollout:
     """One rollout, in the environment of this process.
 
     Args:
         policy: folder of the policy.
         start: its name.
-        max_steps: most commands; None: the default of the simulator.
+        max_steps: most commands.
 
     Raises:
         ConfigError, PolicyError, SimError: as `policy_node.rollouts.rollout` does.
     """
-    limit = MAX_STEPS if max_steps is None else max_steps
     task = task_named(SIMULATED_TASK)
     env = process_environment(task.name)
-    return rollout(env, task, task.start(start), load_policy(policy), limit)
+    return rollout(env, task, task.start(start), load_policy(policy), max_steps)
 
 
 def roll_units(

@@ -9,6 +9,7 @@ import pytest
 from demonstrations import TOPIC_MAP
 
 from curation_ros.bags.cdr import CdrDecoder
+from curation_ros.bags.messages import to_cdr
 from curation_ros.core.episode.stream import header_stamp_ns
 from curation_ros.core.episode.topic_map import topic_map_from_json
 from curation_ros.core.errors import ConfigError, EpisodeError
@@ -36,7 +37,9 @@ def robot(**fields):
 def read_back(topic_map, command):
     """Field -> values at its paths in the messages, and the messages by topic."""
     made = CommandMessages(topic_map, tuple(command))
-    messages = dict(made.encode(command, STAMP_NS))
+    messages = {
+        topic: to_cdr(kind, content) for topic, kind, content in made.messages(command, STAMP_NS)
+    }
     decoder = CdrDecoder()
     values = {
         name: [
@@ -123,7 +126,7 @@ def test_integers_are_rounded_and_kept_in_their_range():
     topic_map = robot(grip=("cmd", "std_msgs/msg/Int8", ["data"]))
     values, _, _ = read_back(topic_map, {"grip": np.array([99.7])})
     assert values == {"grip": [100.0]}
-    with pytest.raises(EpisodeError, match="'data' has value 300, expected a int8"):
+    with pytest.raises(EpisodeError, match="command 'data': 300 is out of the range of int8"):
         read_back(topic_map, {"grip": np.array([300.0])})
 
 

@@ -24,6 +24,7 @@ from other_robots import (
 )
 
 from curation_ros.bags.cdr import CdrDecoder
+from curation_ros.bags.messages import to_cdr
 from curation_ros.cli.main import main as curation
 from curation_ros.core.errors import PolicyError
 from curation_ros.dataset.manifests import save_selection
@@ -95,8 +96,8 @@ def driven(policy, robot, seed):
                 shown.append((sample.stamp_ns, sample.topic, sample.data))
             continue
         for answer in live.sample(sample):
-            encoded = messages.encode(answer.command, answer.stamp_ns)
-            published += [(answer.stamp_ns, topic, data) for topic, data in encoded]
+            for topic, kind, content in messages.messages(answer.command, answer.stamp_ns):
+                published.append((answer.stamp_ns, topic, to_cdr(kind, content)))
     assert live.problem == ""
     assert sorted(p[:2] for p in published) == sorted(s[:2] for s in shown)
 
