@@ -17,12 +17,7 @@ from curation_ros.cli.main import COMMANDS, parser
 from curation_ros.nodes.processes import NODE_MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [
-    ROOT / "README.md",
-    ROOT / "CONTRIBUTING.md",
-    *sorted((ROOT / "docs").glob("*.md")),
-    ROOT / "bags" / "README.md",
-]
+PAGES = [path for folder in ("", "docs", "bags") for path in sorted((ROOT / folder).glob("*.md"))]
 #: Most words of a sentence of prose, on average over a page.
 MEAN_WORDS = 20
 
@@ -78,6 +73,18 @@ def test_files_of_this_repository_exist(page: Path) -> None:
     for code in code_of(page.read_text()):
         for path in re.findall(rf"(?<![\w/.<])(?:{folders})/[\w/]+\.(?:py|md|yaml)\b", code):
             assert any((root / path).exists() for root in (ROOT, ROOT / "curation_ros")), path
+
+
+@pages
+def test_names_of_this_repository_exist(page: Path) -> None:
+    for code in code_of(page.read_text()):
+        packages = "curation_ros|sim_node|policy_node"
+        for name in re.findall(rf"(?<![\w/.-])(?:{packages})(?:\.\w+){{2,}}", code):
+            module, _, member = name.rpartition(".")
+            home = ROOT / module.replace(".", "/")
+            if not (home / f"{member}.py").is_file():
+                source = home / "__init__.py" if home.is_dir() else home.with_suffix(".py")
+                assert re.search(rf"\b{member}\b", source.read_text()), name
 
 
 @pages
@@ -179,6 +186,12 @@ def words_of_sentences(text: str) -> list[int]:
         sentences += re.split(r"(?<=[.!?])[*)\"]*\s+(?=[A-Z0-9\"*(])", prose)
     counts = (len(re.findall(r"\S*\w\S*", sentence)) for sentence in sentences)
     return [n for n in counts if n > 1]
+
+
+def test_design_stays_a_page_of_decisions() -> None:
+    lines = (ROOT / "docs" / "design.md").read_text().splitlines()
+    assert len(lines) < 200, "tables belong on pages of their own"
+    assert max(map(len, lines)) <= 120
 
 
 @pages
