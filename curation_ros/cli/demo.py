@@ -43,6 +43,7 @@ from curation_ros.nodes.demo_events import (
     Selected,
     Training,
 )
+from policy_node.settings import DEFAULTS
 
 #: Selection -> how people read it.
 _SPOKEN = {EVERYTHING: "everything", KEPT: "kept", KEPT_AND_SALVAGED: "kept + salvaged"}
@@ -50,7 +51,7 @@ _SPOKEN = {EVERYTHING: "everything", KEPT: "kept", KEPT_AND_SALVAGED: "kept + sa
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    sizes = DemoSettings()
+    sizes = DemoSettings(DEFAULTS.steps)
     parser.add_argument(
         "--out", type=Path, default=Path("demo"), help="each run gets a folder in it"
     )
@@ -83,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.default_int_handler)
     folder = args.out / f"{datetime.now():%Y-%m-%d-%H%M%S}"
-    settings = DemoSettings(args.demonstrations, args.rollouts, args.train_steps)
+    settings = DemoSettings(args.train_steps, args.rollouts, args.demonstrations)
     output = JsonLines() if args.json else Screen(folder, settings)
     try:
         with closing(output), closing(run_demo(folder, settings)) as events:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from curation_ros.core.episode.status import Status
+from curation_ros.core.errors import ConfigError
 
 #: Names of the selections: one policy is trained on each.
 EVERYTHING, KEPT, KEPT_AND_SALVAGED = "everything", "kept", "kept-and-salvaged"
@@ -15,11 +16,20 @@ EVERYTHING, KEPT, KEPT_AND_SALVAGED = "everything", "kept", "kept-and-salvaged"
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """The size of a demo: demonstrations to record, rollouts and gradient steps per policy."""
+    """The size of a demo: gradient steps and rollouts per policy, demonstrations to record.
 
-    demonstrations: int = 24
+    Raises:
+        ConfigError: if a number is below 1.
+    """
+
+    train_steps: int
     rollouts: int = 10
-    train_steps: int = 4000
+    demonstrations: int = 24
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if (value := getattr(self, field.name)) < 1:
+                raise ConfigError(f"demo: {field.name} is {value}, expected at least 1")
 
 
 @dataclass(frozen=True)

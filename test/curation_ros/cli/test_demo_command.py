@@ -65,7 +65,7 @@ def _selected(*salvaged_s: float) -> Selected:
 
 @pytest.fixture
 def screen(tmp_path: Path) -> Screen:
-    return Screen(tmp_path, DemoSettings())
+    return Screen(tmp_path, DemoSettings(train_steps=4000))
 
 
 def _text(capsys: pytest.CaptureFixture[str]) -> str:
@@ -159,6 +159,17 @@ def test_comparison_claims_no_more_than_the_counts_show(
 ) -> None:
     [one] = comparisons({KEPT: _result(kept), EVERYTHING: _result(everything)})
     assert compared(one).startswith(text)
+
+
+@pytest.mark.parametrize("option", ["--demonstrations", "--rollouts", "--train-steps"])
+def test_size_below_one_is_refused(curation: Any, tmp_path: Path, option: str) -> None:
+    told = curation("demo", "--out", str(tmp_path), option, "0")
+    assert told.code == 2
+    assert (
+        told.err
+        == f"error: demo: {option.lstrip('-').replace('-', '_')} is 0, expected at least 1\n"
+    )
+    assert list(tmp_path.iterdir()) == []
 
 
 # --- as JSON --------------------------------------------------------------------------------
