@@ -51,6 +51,7 @@ $(BIN)/ruff format --check .
 $(BIN)/mypy
 $(BIN)/lint-imports --no-logo
 $(BIN)/python docs/make_metrics.py --check
+$(BIN)/python docs/make_api.py --check
 endef
 
 check: setup
@@ -67,6 +68,7 @@ test: check
 
 docs: setup
 	$(BIN)/python docs/make_metrics.py
+	$(BIN)/python docs/make_api.py
 
 bench: setup
 	$(BIN)/python benchmarks/run.py

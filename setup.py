@@ -114,6 +114,7 @@ setup(
             "mypy>=1.11",
             "pre-commit>=3.2",
             "pre-commit-hooks>=4.5",
+            "pandas",
             "pyarrow>=14",
             "pytest>=8",
             "pytest-xdist>=3.5",

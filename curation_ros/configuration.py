@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from curation_ros.core.decision.rules import RULES, Rule
+from curation_ros.core.decision.rules import RULES, Rule, given_params
 from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap, read_topic_map
@@ -82,6 +82,36 @@ def read_settings(config: Path | None, overrides: Mapping[str, Any]) -> Curation
         return CurationSettings(**settings)
     except ConfigError as err:
         raise ConfigError(f"{where}: {err}" if config and not given else str(err)) from err
+
+
+def settings_of(
+    config: Path | None = None,
+    *,
+    scorers: Iterable[str] = (),
+    rule: str = "",
+    rule_scorer: str = "",
+    value: float | None = None,
+    method: str = "",
+) -> CurationSettings:
+    """Settings from what a person asks for on a command line or in a call.
+
+    Args:
+        config: a file like `config/curation.yaml`; None: that one.
+        scorers: names, in addition to the scorer that decides; none: those of the file.
+        rule: name of the rule; empty: that of the file.
+        rule_scorer: the scorer that decides; empty: that of the file.
+        value: the threshold, share or number of `rule`.
+        method: how the rule `gap` separates groups.
+
+    Raises:
+        ConfigError: naming what does not exist or does not fit.
+    """
+    given: dict[str, Any] = {"scorers": list(scorers), "rule": rule, "rule_scorer": rule_scorer}
+    if rule:
+        given["rule_params"] = given_params(rule, value, method)
+    elif value is not None or method:
+        raise ConfigError("a value or a method belongs to a rule: name one")
+    return read_settings(config or share_file("config/curation.yaml"), given)
 
 
 def _read_file(config: Path, where: str) -> dict[str, Any]:

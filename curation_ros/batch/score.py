@@ -14,7 +14,7 @@ from curation_ros.batch.examine import EpisodesOf, Examined, Examiner
 from curation_ros.batch.workers import check_workers
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import CURATOR, Decision, Verdict, in_force
-from curation_ros.core.decision.examination import Examination
+from curation_ros.core.decision.examination import Examination, Scores
 from curation_ros.core.decision.fitted_rule import FittedRule
 from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.decision.ties import TieKey
@@ -32,7 +32,7 @@ class Scored:
     """A bag that was scored and decided on.
 
     Attributes:
-        path: the bag.
+        path: the bag; for an episode in memory, its id.
         examination: what was found in it.
         decision: what becomes of it. With logging it is the decision in force, which may be a
             person's; scores and findings are those of now in any case.
@@ -52,6 +52,16 @@ class Scored:
     replaced: Verdict | None = None
     overridden_by: Decision | None = None
     warning: str = ""
+
+    @property
+    def scores(self) -> Scores:
+        """Scorer -> score, None where it abstained."""
+        return self.examination.scores
+
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict of the decision."""
+        return self.decision.verdict
 
     def to_json(self) -> dict[str, Any]:
         """As `curation score --json` prints it."""
@@ -280,6 +290,43 @@ def score_bags(
     )
 
 
+def score_episodes(
+    episodes: Iterable[Episode],
+    settings: CurationSettings | None = None,
+    reference: Iterable[Episode] = (),
+) -> Iterator[Scored]:
+    """Score episodes that are in memory and decide on them; nothing is kept or logged.
+
+    Args:
+        episodes: in any order; of two copies the first is the original.
+        settings: what scores and what decides; by default those of `CurationSettings`.
+        reference: trusted demonstrations; may be empty.
+
+    Raises:
+        EpisodeError: if the reference cannot be trusted.
+    """
+    given = list(episodes)
+    curation = Curation.fit(settings, reference)
+    if curation.scorers.needs_dataset:
+        curation = curation.fit_dataset(given)
+    for result in _decided(curation, _InMemory(curation, given), (), iter):
+        if isinstance(result, Scored):
+            yield result
+
+
+class _InMemory:
+    """Examines episodes that were read already; the id of each stands for its path."""
+
+    def __init__(self, curation: Curation, episodes: Sequence[Episode]) -> None:
+        self._examined = [
+            Examined(Path(e.id), curation.examine(e), is_known=False) for e in episodes
+        ]
+
+    def run(self, bags: Sequence[Path]) -> Iterator[Examined]:
+        """All of them, whatever bags are named."""
+        return iter(self._examined)
+
+
 def decide_dataset(
     dataset: Dataset, curation: Curation, topic_map: TopicMap | None = None
 ) -> tuple[Curation, list[Decision]]:
@@ -313,7 +360,7 @@ def _find(paths: Iterable[Path]) -> tuple[list[Path], list[Unreadable]]:
 
 
 def _decided(
-    curation: Curation, examiner: Examiner, bags: Sequence[Path], progress: Progress
+    curation: Curation, examiner: Examiner | _InMemory, bags: Sequence[Path], progress: Progress
 ) -> Iterator[ScoringResult]:
     """Results before anything is logged.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 from rich.progress import track
 
@@ -14,12 +13,10 @@ from curation_ros.batch.score import Scored, Scoring, ScoringResult, Unreadable,
 from curation_ros.cli.arguments import add_config, add_reference, add_rule, add_workers
 from curation_ros.cli.output import console, print_json, progress_console, warn
 from curation_ros.cli.score_table import score_table
-from curation_ros.configuration import read_reference, read_settings, share_file
+from curation_ros.configuration import read_reference, settings_of
 from curation_ros.core.decision.decision import VERDICTS
-from curation_ros.core.decision.rules import given_params
 from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.topic_map import read_topic_map
-from curation_ros.core.errors import ConfigError
 
 _DONE, _FINDINGS, _NOTHING = 0, 1, 3
 #: Fewer bags need no progress bar and no summary; more names than this are not listed.
@@ -87,17 +84,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _settings(args: argparse.Namespace) -> CurationSettings:
-    names = [n.strip() for n in args.scorers.split(",")] if args.scorers else None
-    given: dict[str, Any] = {
-        "scorers": names,
-        "rule": args.rule,
-        "rule_scorer": args.rule_scorer,
-    }
-    if args.rule:
-        given["rule_params"] = given_params(args.rule, args.value, args.method)
-    elif args.value is not None or args.method:
-        raise ConfigError("--value and --method belong to a --rule: name one")
-    return read_settings(args.config or share_file("config/curation.yaml"), given)
+    return settings_of(
+        args.config,
+        scorers=[n.strip() for n in args.scorers.split(",")] if args.scorers else (),
+        rule=args.rule or "",
+        rule_scorer=args.rule_scorer or "",
+        value=args.value,
+        method=args.method or "",
+    )
 
 
 def _with_progress(scoring: Scoring) -> Iterator[ScoringResult]:

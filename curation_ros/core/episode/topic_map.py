@@ -322,10 +322,13 @@ def topic_map_from_json(raw: object, where: str = "topic map") -> TopicMap:
     )
 
 
-def read_topic_map(path: Path) -> TopicMap:
+def read_topic_map(path: Path | str) -> TopicMap:
     """Read a topic map from a YAML file.
+
+    Args:
+        path: a file like `config/topics.yaml`.
 
     Raises:
         ConfigError: if the file is missing, is not YAML or is no topic map.
     """
-    return topic_map_from_json(read_yaml(path, "topic map"), str(path))
+    return topic_map_from_json(read_yaml(Path(path), "topic map"), str(path))
