@@ -195,10 +195,10 @@ GRAPHS: dict[str, Callable[[Episode, np.random.Generator], Episode]] = {
 
 
 def _alerted(episode: Episode) -> Verdict:
-    told = AlertWatch(episode.topic_map).take(episode)
-    if told is None:
+    alert = AlertWatch(episode.topic_map).take(episode)
+    if alert is None:
         return Verdict(False)
-    return Verdict(True, int(np.searchsorted(episode.stamps_ns, episode.start_ns + told.span[1])))
+    return Verdict(True, int(np.searchsorted(episode.stamps_ns, episode.start_ns + alert.span[1])))
 
 
 DETECTORS |= {

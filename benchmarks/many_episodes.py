@@ -57,10 +57,10 @@ class Template:
         """Write it as episode number `k`: only the last digits of the orientation differ."""
         episode, start_ns = new_episode_id(), (1_700_000_000 + 1000 * k) * NS_PER_S
         end_ns = start_ns + (N_STEPS - 1) * _STEP_NS
-        said = json.loads(self.bag.custom_data["episode"])
-        said |= {"id": episode, "name": f"many-{k:05d}", "start_stamp": start_ns}
-        said |= {"end_stamp": end_ns, "counts": dict.fromkeys(said["counts"], N_STEPS)}
-        data = {**self.bag.custom_data, "episode": json.dumps(said)}
+        event = json.loads(self.bag.custom_data["episode"])
+        event |= {"id": episode, "name": f"many-{k:05d}", "start_stamp": start_ns}
+        event |= {"end_stamp": end_ns, "counts": dict.fromkeys(event["counts"], N_STEPS)}
+        data = {**self.bag.custom_data, "episode": json.dumps(event)}
         folder = dataset.bag_path(episode)
         writer = BagWriter(folder, episode, custom_data=data)
         for topic, found in self.bag.topics.items():

@@ -1,4 +1,4 @@
-"""`curation report`: a study's results for people."""
+"""`curation report`: the results of a study as a report."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from curation_ros.cli.output import print_json, say
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument(
-        "results", type=Path, help="results.json of `curation benchmark`, or its folder"
+        "results", type=Path, help="results.json of `curation benchmark`, or the folder of it"
     )
     parser.add_argument(
-        "--out", type=Path, help="folder of the report; default: where the results are"
+        "--out", type=Path, help="folder of the report; default: the folder of the results"
     )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the report and say where it is."""
+    """Write the report and print the paths of its files."""
     from curation_ros.reporting import read_results, write_report
 
     path = args.results / "results.json" if args.results.is_dir() else args.results
@@ -34,5 +34,5 @@ def run(args: argparse.Namespace) -> int:
         for path in written:
             say(str(path))
         if missing:
-            say(f"{missing} outcomes are missing; the report says which")
+            say(f"{missing} outcomes are missing; the report names them")
     return 0

@@ -28,7 +28,7 @@ def _settings(**changes: Any) -> AuditSettings:
     return AuditSettings(**{"scorers": FAST, **DRAWS, **changes})
 
 
-def _told(dataset: Dataset, episode: Episode, good: bool, **truth: Any) -> Episode:
+def _labelled(dataset: Dataset, episode: Episode, good: bool, **truth: Any) -> Episode:
     outcome, defect = ("succeeded", "none") if good else ("failed", "early_release")
     dataset.append_truth({"episode": episode.id, "outcome": outcome, "defect": defect, **truth})
     return episode
@@ -43,7 +43,7 @@ def _contaminated(
         make_episode(rng, n, task_steps=240, open_at=120 + 3 * k, name=f"bad-{k}")
         for k, n in enumerate(bad_steps)
     ]
-    return [_told(dataset, e, e in good) for e in (*good, *bad)]
+    return [_labelled(dataset, e, e in good) for e in (*good, *bad)]
 
 
 def _row(audited: Audit, scorer: str) -> dict[str, Any]:
@@ -54,14 +54,14 @@ def _row(audited: Audit, scorer: str) -> dict[str, Any]:
 # --- labels -------------------------------------------------------------------------------------
 
 
-def test_labels_turned_over_turn_over_every_figure_and_no_score(
+def test_flipped_labels_mirror_every_auroc_and_change_no_score(
     dataset: Dataset, rng: np.random.Generator, tmp_path: Any
 ) -> None:
     episodes = _contaminated(dataset, rng)
     reference = make_reference(rng)
     turned = Dataset(tmp_path / "turned", create=True)
     for episode in episodes:
-        _told(turned, episode, not read_labels(dataset, "success")[episode.id])
+        _labelled(turned, episode, not read_labels(dataset, "success")[episode.id])
     settings = _settings(scorers=tuple(SCORERS))
     one, other = (audit(d, episodes, reference, settings) for d in (dataset, turned))
     assert len(one.rows) == len(SCORERS) + 1
@@ -78,13 +78,13 @@ def test_labels_turned_over_turn_over_every_figure_and_no_score(
 def test_labels_of_one_kind_are_refused_with_an_explanation(
     dataset: Dataset, rng: np.random.Generator, good: bool
 ) -> None:
-    episodes = [_told(dataset, make_episode(rng), good) for _ in range(3)]
-    said = f"{3 * good} good and {3 * (not good)} bad of 3 episodes.*needs some of both"
-    with pytest.raises(EpisodeError, match=said):
+    episodes = [_labelled(dataset, make_episode(rng), good) for _ in range(3)]
+    message = f"{3 * good} good and {3 * (not good)} bad of 3 episodes.*needs some of both"
+    with pytest.raises(EpisodeError, match=message):
         audit(dataset, episodes, settings=_settings())
 
 
-def test_dataset_without_truth_is_refused_with_the_number_that_lacks_it(
+def test_dataset_without_truth_is_refused_with_the_number_of_unlabelled(
     dataset: Dataset, rng: np.random.Generator
 ) -> None:
     with pytest.raises(EpisodeError, match="2 have no such label"):
@@ -103,7 +103,7 @@ def test_episodes_without_a_label_or_in_the_reference_are_left_out_and_counted(
     assert "2 episodes are in the reference: left out" in audited.notes
 
 
-def test_whether_both_labels_agree_is_said(dataset: Dataset, rng: np.random.Generator) -> None:
+def test_note_compares_both_kinds_of_labels(dataset: Dataset, rng: np.random.Generator) -> None:
     episodes = _contaminated(dataset, rng)
     assert "the labels 'defect' say the same of all 8 episodes" in (
         audit(dataset, episodes, settings=_settings()).notes
@@ -145,7 +145,9 @@ def test_figures_are_those_of_the_scores(dataset: Dataset, rng: np.random.Genera
     assert _row(audited, "knn")["needs"] == "reference"
 
 
-def test_length_that_is_cut_away_tells_nothing(dataset: Dataset, rng: np.random.Generator) -> None:
+def test_length_that_is_cut_away_detects_nothing(
+    dataset: Dataset, rng: np.random.Generator
+) -> None:
     episodes = _contaminated(dataset, rng)
     row = _row(
         audit(dataset, episodes, settings=_settings(length="fixed", length_value=200)), "length"
@@ -157,7 +159,7 @@ def test_length_that_is_cut_away_tells_nothing(dataset: Dataset, rng: np.random.
     assert path["auroc_raw"] is not None
 
 
-def test_length_that_is_left_after_control_is_said(
+def test_length_that_is_left_after_control_is_noted(
     dataset: Dataset, rng: np.random.Generator
 ) -> None:
     episodes = _contaminated(dataset, rng)
@@ -172,7 +174,7 @@ def test_length_that_is_left_after_control_is_said(
     assert not [note for note in whole if "shorter" in note or "not controlled" in note]
 
 
-def test_length_that_separates_the_labels_leaves_no_question_at_equal_length(
+def test_nothing_is_identifiable_if_length_separates_the_labels(
     dataset: Dataset, rng: np.random.Generator
 ) -> None:
     audited = audit(dataset, _contaminated(dataset, rng), settings=_settings())
@@ -187,7 +189,7 @@ def test_length_that_separates_the_labels_leaves_no_question_at_equal_length(
             assert any(n.startswith("not identifiable at equal length") for n in row["notes"])
 
 
-def test_lengths_that_overlap_leave_a_question_with_an_answer(
+def test_overlapping_lengths_are_compared_at_equal_length(
     dataset: Dataset, rng: np.random.Generator
 ) -> None:
     episodes = _contaminated(dataset, rng, bad_steps=[228, 234, 240, 246])
@@ -202,11 +204,11 @@ def test_lengths_that_overlap_leave_a_question_with_an_answer(
     assert length["p_label_length_held"] == 1.0
 
 
-def test_abstentions_are_counted_and_the_reason_is_said(
+def test_abstentions_are_counted_and_the_reason_is_noted(
     dataset: Dataset, rng: np.random.Generator
 ) -> None:
     episodes = _contaminated(dataset, rng)
-    episodes.append(_told(dataset, make_episode(rng, close_at=None), True))
+    episodes.append(_labelled(dataset, make_episode(rng, close_at=None), True))
     row = _row(audit(dataset, episodes, settings=_settings()), "gripper_timing")
     assert (row["abstained"], row["abstained_raw"], row["n_scored"]) == (1, 1, 8)
     assert row["notes"][0] == "1 abstained: the gripper was never commanded to close"
@@ -214,7 +216,7 @@ def test_abstentions_are_counted_and_the_reason_is_said(
     assert row["clean_recall"] == pytest.approx(4 / 5)  # of all good ones: it is not kept
 
 
-def test_scorers_without_their_reference_abstain_and_the_row_says_so(
+def test_scorers_without_their_reference_abstain_with_a_note(
     dataset: Dataset, rng: np.random.Generator
 ) -> None:
     row = _row(audit(dataset, _contaminated(dataset, rng), settings=_settings()), "knn")
@@ -273,14 +275,14 @@ def test_starts_that_recur_give_an_interval_over_starts(
         for good in (True, False):
             steps = int(rng.integers(225, 250))
             made = make_episode(rng, steps, open_at=-1 if good == (k > 1) else 120)
-            episodes.append(_told(dataset, made, good, task="t", start=f"s{k}", repetition=0))
+            episodes.append(_labelled(dataset, made, good, task="t", start=f"s{k}", repetition=0))
     row = _row(audit(dataset, episodes, settings=_settings(length="none")), "gripper_timing")
     assert row["ci_starts"] is not None
     low, high = row["ci_starts"]
     assert low < row["auroc_controlled"] < high
 
 
-def test_perfect_ranking_has_no_bootstrap_interval_and_says_so(
+def test_perfect_ranking_has_a_note_instead_of_a_bootstrap_interval(
     dataset: Dataset, rng: np.random.Generator
 ) -> None:
     episodes = _contaminated(dataset, rng)
@@ -308,7 +310,7 @@ def test_perfect_ranking_has_no_bootstrap_interval_and_says_so(
         ("", None, 230, "dataset"),  # the 5th percentile of 228, 234, 240, 246 and 4 times 300
     ],
 )
-def test_length_control_says_what_it_needs(
+def test_length_control_declares_its_needs(
     dataset: Dataset,
     rng: np.random.Generator,
     length: str,
@@ -344,7 +346,7 @@ def test_keeping_more_than_have_a_score_is_noted(
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"labels": "nose"}, "expected one of success, defect"),
         ({"keep": 0}, "keep 0"),
@@ -357,10 +359,10 @@ def test_keeping_more_than_have_a_score_is_noted(
     ],
 )
 def test_wrong_settings_raise(
-    dataset: Dataset, rng: np.random.Generator, changes: dict[str, Any], said: str
+    dataset: Dataset, rng: np.random.Generator, changes: dict[str, Any], message: str
 ) -> None:
     episodes = _contaminated(dataset, rng)
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         audit(dataset, episodes, settings=_settings(**changes))
 
 
@@ -387,7 +389,7 @@ def test_bags_that_cannot_be_read_are_listed_and_the_others_audited(
         audit_dataset(dataset, settings=_settings())
     for k in range(4):
         episode = make_episode(rng, 228 + 6 * k, open_at=-1 if k < 2 else 120)
-        record(dataset, _told(dataset, episode, k < 2))
+        record(dataset, _labelled(dataset, episode, k < 2))
     audited = audit_dataset(dataset, settings=_settings())
     assert len(audited.problems) == 1
     assert str(broken) in audited.problems[0]

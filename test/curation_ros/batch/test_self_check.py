@@ -61,7 +61,7 @@ class Resolver(Peeker):
 
 
 @pytest.fixture
-def told(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+def labelled(dataset: Dataset, rng: np.random.Generator) -> Dataset:
     """Two good episodes and two early releases, with their truth."""
     for k, open_at in enumerate((-1, -1, 120, 140)):
         episode = make_episode(rng, name=f"pick-{k}", open_at=open_at)
@@ -115,13 +115,13 @@ def test_each_label_becomes_another_one(key: str, value: object, expected: objec
 
 
 def test_scores_and_decisions_are_equal_to_the_last_bit(
-    told: Dataset, rng: np.random.Generator, tmp_path: Path
+    labelled: Dataset, rng: np.random.Generator, tmp_path: Path
 ) -> None:
     reference = Dataset(tmp_path / "reference", create=True)
     for episode in make_reference(rng, 4):
         record(reference, episode)
         reference.append_truth({"episode": episode.id, "outcome": "succeeded"})
-    done = self_check(told, CurationSettings(scorers=tuple(SCORERS)), [reference.path])
+    done = self_check(labelled, CurationSettings(scorers=tuple(SCORERS)), [reference.path])
     assert done.differences == ()
     assert (done.episodes, done.unreadable, done.overrides) == (4, 0, 0)
     assert done.labels == 4 * (len(TRUTH) - len(IDENTITY) + 1) + 4
@@ -133,22 +133,22 @@ def test_scores_and_decisions_are_equal_to_the_last_bit(
     ("rule", "value"), [("threshold", None), ("top-fraction", 0.5), ("top-k", 2)]
 )
 def test_rules_that_look_at_the_dataset_are_checked(
-    told: Dataset, rule: str, value: float | None
+    labelled: Dataset, rule: str, value: float | None
 ) -> None:
     params = {} if value is None else {"value": value}
-    done = self_check(told, _settings(rule=rule, rule_params=params))
+    done = self_check(labelled, _settings(rule=rule, rule_params=params))
     assert (done.differences, done.episodes) == ((), 4)
 
 
-def test_nothing_is_written_to_the_dataset(told: Dataset, rng: np.random.Generator) -> None:
-    before = dict(_files(told.path))
-    self_check(told, _settings())
-    assert dict(_files(told.path)) == before
+def test_nothing_is_written_to_the_dataset(labelled: Dataset, rng: np.random.Generator) -> None:
+    before = dict(_files(labelled.path))
+    self_check(labelled, _settings())
+    assert dict(_files(labelled.path)) == before
 
 
 @pytest.mark.parametrize("cheat", [Peeker], indirect=True)
-def test_scorer_that_reads_the_truth_is_found(told: Dataset, cheat: str) -> None:
-    done = self_check(told, _settings(cheat))
+def test_scorer_that_reads_the_truth_is_found(labelled: Dataset, cheat: str) -> None:
+    done = self_check(labelled, _settings(cheat))
     scores = [d for d in done.differences if d.field == "score/cheat"]
     assert len(scores) == 4
     assert {(d.original, d.flipped) for d in scores} == {("1.0", "0.0"), ("0.0", "1.0")}
@@ -157,9 +157,9 @@ def test_scorer_that_reads_the_truth_is_found(told: Dataset, cheat: str) -> None
 
 
 @pytest.mark.parametrize("cheat", [Peeker], indirect=True)
-def test_verdict_that_rests_on_the_truth_is_found(told: Dataset, cheat: str) -> None:
+def test_verdict_that_rests_on_the_truth_is_found(labelled: Dataset, cheat: str) -> None:
     done = self_check(
-        told,
+        labelled,
         _settings(cheat, rule="threshold", rule_scorer=cheat, rule_params={"threshold": 0.5}),
     )
     fields = {d.field for d in done.differences}
@@ -167,18 +167,18 @@ def test_verdict_that_rests_on_the_truth_is_found(told: Dataset, cheat: str) -> 
 
 
 @pytest.mark.parametrize("cheat", [Resolver], indirect=True)
-def test_link_does_not_lead_back_to_the_labels_as_they_are(told: Dataset, cheat: str) -> None:
-    assert self_check(told, _settings(cheat)).differences
+def test_link_does_not_lead_back_to_the_unchanged_labels(labelled: Dataset, cheat: str) -> None:
+    assert self_check(labelled, _settings(cheat)).differences
 
 
 @pytest.mark.parametrize("cheat", [Listener], indirect=True)
-def test_scorer_that_follows_people_is_found(told: Dataset, cheat: str) -> None:
+def test_scorer_that_reads_decisions_of_people_is_found(labelled: Dataset, cheat: str) -> None:
     fitted = Curation.fit(_settings())
-    for bag in told.bags():
-        [name] = [n for i, n in told.names() if i == bag.name]
-        log_decision(told, decide_on(fitted, make_episode(episode_id=bag.name, name=name)))
-        log_override(told, bag.name, "keep", "fine", "Ada")
-    done = self_check(told, _settings(cheat))
+    for bag in labelled.bags():
+        [name] = [n for i, n in labelled.names() if i == bag.name]
+        log_decision(labelled, decide_on(fitted, make_episode(episode_id=bag.name, name=name)))
+        log_override(labelled, bag.name, "keep", "fine", "Ada")
+    done = self_check(labelled, _settings(cheat))
     assert done.overrides == 4
     assert {d.field for d in done.differences} >= {"score/cheat"}
 
@@ -197,9 +197,9 @@ def test_dataset_without_an_episode_is_nothing_to_check(dataset: Dataset) -> Non
         self_check(dataset, _settings())
 
 
-def test_unreadable_bag_is_counted(told: Dataset) -> None:
-    broken = told.bag_path("broken")
+def test_unreadable_bag_is_counted(labelled: Dataset) -> None:
+    broken = labelled.bag_path("broken")
     broken.mkdir()
     (broken / "broken_0.mcap").write_bytes(b"")
-    done = self_check(told, _settings())
+    done = self_check(labelled, _settings())
     assert (done.unreadable, done.episodes, done.differences) == (1, 4, ())

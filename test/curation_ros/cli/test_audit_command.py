@@ -28,7 +28,7 @@ Run = Callable[..., Any]
 
 
 @pytest.fixture
-def told_data(folder: Path) -> Path:
+def labelled_data(folder: Path) -> Path:
     """The dataset with its truth: pick-2 and pick-3 are early releases that failed."""
     dataset = Dataset(folder / "data")
     for bag in find_episodes([folder / "data"]):
@@ -50,34 +50,34 @@ def _fast(folder: Path) -> list[object]:
     return [*scorers, "--reference", folder / "reference"]
 
 
-def test_json_is_a_line_a_scorer_with_exactly_the_keys(
-    curation: Run, folder: Path, told_data: Path
+def test_json_is_one_line_per_scorer_with_exactly_these_keys(
+    curation: Run, folder: Path, labelled_data: Path
 ) -> None:
-    told = curation("audit", told_data, *_fast(folder), "--json")
-    assert told.code == DONE, told.err
-    assert [r["scorer"] for r in told.rows] == ["length_path", "knn", "gripper_timing", "length"]
-    for row in told.rows:
+    done = curation("audit", labelled_data, *_fast(folder), "--json")
+    assert done.code == DONE, done.err
+    assert [r["scorer"] for r in done.rows] == ["length_path", "knn", "gripper_timing", "length"]
+    for row in done.rows:
         assert set(row) == KEYS
         assert list(row)[:2] == ["scorer", "needs"]
-    timing = told.rows[2]
+    timing = done.rows[2]
     assert timing["auroc_controlled"] == 1.0
     assert (timing["labels"], timing["n_good"], timing["n_bad"]) == ("success", 3, 2)
     assert timing["permutations"] == 99
     assert timing["length_control"]["mode"] == "shortest-reference"
-    assert "NaN" not in told.out
+    assert "NaN" not in done.out
 
 
-def test_every_key_stands_in_the_docs() -> None:
+def test_every_key_is_documented() -> None:
     text = (Path(__file__).resolve().parents[3] / "docs" / "audit.md").read_text()
     assert not [key for key in sorted(KEYS) if f"`{key}`" not in text]
 
 
 def test_table_shows_every_scorer_what_it_needs_and_the_paper(
-    curation: Run, folder: Path, told_data: Path
+    curation: Run, folder: Path, labelled_data: Path
 ) -> None:
-    told = curation("audit", told_data, *_fast(folder), "--labels", "defect")
-    assert told.code == DONE, told.err
-    text = " ".join(told.out.split())
+    done = curation("audit", labelled_data, *_fast(folder), "--labels", "defect")
+    assert done.code == DONE, done.err
+    text = " ".join(done.out.split())
     assert "3 good and 2 bad by the label 'defect'; 5 reference episodes" in text
     assert "needs reference" in text
     assert "gripper timing nothing 1.000" in text
@@ -86,7 +86,7 @@ def test_table_shows_every_scorer_what_it_needs_and_the_paper(
     assert "99 permutations, seed 0" in text
 
 
-def test_not_identifiable_is_said_in_the_table_and_in_json(
+def test_not_identifiable_is_in_the_table_and_in_json(
     curation: Run, dataset: Dataset, rng: np.random.Generator
 ) -> None:
     for n_steps, outcome in ((228, "succeeded"), (234, "succeeded"), (300, "failed")):
@@ -102,31 +102,31 @@ def test_not_identifiable_is_said_in_the_table_and_in_json(
         assert sum("not identifiable" in note for note in row["notes"]) == 2
 
 
-def test_same_call_prints_the_same(curation: Run, folder: Path, told_data: Path) -> None:
-    first = curation("audit", told_data, *_fast(folder), "--json")
-    assert curation("audit", told_data, *_fast(folder), "--json").out == first.out
+def test_same_call_prints_the_same(curation: Run, folder: Path, labelled_data: Path) -> None:
+    first = curation("audit", labelled_data, *_fast(folder), "--json")
+    assert curation("audit", labelled_data, *_fast(folder), "--json").out == first.out
 
 
-def test_unreadable_bag_is_told_and_the_others_are_audited(
-    curation: Run, folder: Path, told_data: Path
+def test_unreadable_bag_is_reported_and_the_others_are_audited(
+    curation: Run, folder: Path, labelled_data: Path
 ) -> None:
-    broken = told_data / "episodes" / "broken"
+    broken = labelled_data / "episodes" / "broken"
     broken.mkdir()
     (broken / "broken_0.mcap").write_bytes(b"")
-    told = curation("audit", told_data, *_fast(folder), "--json")
-    assert told.code == DONE
-    assert told.rows[0]["n_good"] == 3
-    assert str(broken) in told.err
+    done = curation("audit", labelled_data, *_fast(folder), "--json")
+    assert done.code == DONE
+    assert done.rows[0]["n_good"] == 3
+    assert str(broken) in done.err
 
 
 def test_dataset_without_labels_is_nothing_to_audit(curation: Run, folder: Path) -> None:
-    told = curation("audit", folder / "data", *_fast(folder), "--json")
-    assert (told.code, told.out) == (NOTHING, "")
-    assert "5 have no such label in truth.jsonl" in told.err
+    done = curation("audit", folder / "data", *_fast(folder), "--json")
+    assert (done.code, done.out) == (NOTHING, "")
+    assert "5 have no such label in truth.jsonl" in done.err
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["--labels", "nose"], USAGE, "nose"),
         (["--scorers", "nose"], USAGE, "no scorer 'nose'"),
@@ -140,12 +140,12 @@ def test_dataset_without_labels_is_nothing_to_audit(curation: Run, folder: Path)
     ],
 )
 def test_wrong_usage_is_one_line_and_a_code(
-    curation: Run, told_data: Path, arguments: list[str], code: int, said: str
+    curation: Run, labelled_data: Path, arguments: list[str], code: int, message: str
 ) -> None:
-    told = curation("audit", told_data, *arguments, "--json")
-    assert (told.code, told.out) == (code, "")
-    assert said in told.err
-    assert "internal error" not in told.err
+    done = curation("audit", labelled_data, *arguments, "--json")
+    assert (done.code, done.out) == (code, "")
+    assert message in done.err
+    assert "internal error" not in done.err
 
 
 @pytest.mark.parametrize(
@@ -158,26 +158,26 @@ def test_wrong_usage_is_one_line_and_a_code(
     ],
 )
 def test_length_control_is_chosen_by_name_and_value(
-    curation: Run, told_data: Path, length: str, mode: str, steps: int | None, needs: str
+    curation: Run, labelled_data: Path, length: str, mode: str, steps: int | None, needs: str
 ) -> None:
     options = ["--scorers", "gripper_timing", "--permutations", 9, "--length", length]
-    told = curation("audit", told_data, *options, "--json")
-    control = told.rows[0]["length_control"]
+    done = curation("audit", labelled_data, *options, "--json")
+    control = done.rows[0]["length_control"]
     assert (control["mode"], control["steps"], control["needs"]) == (mode, steps, needs)
 
 
 def test_parameters_of_scorers_come_from_the_config(
-    curation: Run, told_data: Path, tmp_path: Path
+    curation: Run, labelled_data: Path, tmp_path: Path
 ) -> None:
     options = ["--scorers", "gripper_timing", "--permutations", 9, "--json", "--length", "none"]
     (tmp_path / "c.yaml").write_text("scorer_params: {gripper_timing: {'on': nose}}\n")
-    told = curation("audit", told_data, *options, "--config", tmp_path / "c.yaml")
-    assert (told.code, told.out) == (USAGE, "")
-    assert "on is 'nose'" in told.err
+    done = curation("audit", labelled_data, *options, "--config", tmp_path / "c.yaml")
+    assert (done.code, done.out) == (USAGE, "")
+    assert "on is 'nose'" in done.err
 
 
-def test_number_to_keep_is_taken(curation: Run, told_data: Path) -> None:
+def test_number_to_keep_is_taken(curation: Run, labelled_data: Path) -> None:
     options = ["--scorers", "gripper_timing", "--permutations", 9, "--json", "--keep"]
-    by_number = curation("audit", told_data, *options, "2").rows[0]
-    by_share = curation("audit", told_data, *options, "0.4").rows[0]
+    by_number = curation("audit", labelled_data, *options, "2").rows[0]
+    by_share = curation("audit", labelled_data, *options, "0.4").rows[0]
     assert (by_number["n_kept"], by_share["n_kept"]) == (2, 2)

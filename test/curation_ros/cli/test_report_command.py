@@ -32,11 +32,13 @@ def test_the_report_is_written_where_it_is_asked_for(
     assert answer.code == DONE
     assert answer.out.splitlines()[0] == str(tmp_path / "out" / "report.html")
     assert {p.name for p in (tmp_path / "out").iterdir()} >= {"report.html", "report.md"}
-    assert "outcomes are missing; the report says which" in answer.out
+    assert "outcomes are missing; the report names them" in answer.out
 
 
 @pytest.mark.parametrize("of", ["folder", "file"])
-def test_the_report_is_written_beside_the_results(curation: Run, results: Path, of: str) -> None:
+def test_the_report_is_written_to_the_folder_of_the_results(
+    curation: Run, results: Path, of: str
+) -> None:
     answer = curation("report", results if of == "file" else results.parent, "--json")
     assert answer.code == DONE
     [row] = answer.rows
@@ -55,7 +57,7 @@ def test_the_report_is_written_beside_the_results(curation: Run, results: Path, 
         ('{"format": 1, "name": NaN}', "NaN is no JSON"),
     ],
 )
-def test_what_is_no_results_is_refused_in_a_line(
+def test_wrong_results_are_refused_in_one_line(
     curation: Run, tmp_path: Path, text: str, complaint: str
 ) -> None:
     path = tmp_path / "results.json"

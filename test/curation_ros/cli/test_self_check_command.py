@@ -15,7 +15,7 @@ Run = Callable[..., Any]
 
 
 @pytest.fixture
-def told_data(folder: Path) -> Path:
+def labelled_data(folder: Path) -> Path:
     """The dataset, with a truth for each episode."""
     dataset = Dataset(folder / "data")
     for k, bag in enumerate(dataset.bags()):
@@ -24,11 +24,11 @@ def told_data(folder: Path) -> Path:
     return folder / "data"
 
 
-def test_proof_is_told_to_programs(curation: Run, folder: Path, told_data: Path) -> None:
+def test_proof_as_json(curation: Run, folder: Path, labelled_data: Path) -> None:
     options = ["--reference", folder / "reference", "--json"]
-    told = curation("self-check", told_data, *options)
-    assert told.code == PROVEN, told.err
-    [row] = told.rows
+    done = curation("self-check", labelled_data, *options)
+    assert done.code == PROVEN, done.err
+    [row] = done.rows
     assert set(row) == {
         "labels", "overrides", "episodes", "scores", "unreadable", "differences"
     }  # fmt: skip
@@ -36,31 +36,31 @@ def test_proof_is_told_to_programs(curation: Run, folder: Path, told_data: Path)
     assert row["scores"] > 5 * 5
 
 
-def test_proof_is_told_to_people(curation: Run, told_data: Path) -> None:
-    told = curation("self-check", told_data)
-    assert told.code == PROVEN, told.err
-    assert told.out.startswith("flipped 10 labels and 0 decisions of people; compared ")
-    assert told.out.endswith("all are equal to the last bit\n")
+def test_proof_as_text(curation: Run, labelled_data: Path) -> None:
+    done = curation("self-check", labelled_data)
+    assert done.code == PROVEN, done.err
+    assert done.out.startswith("flipped 10 labels and 0 decisions of people; compared ")
+    assert done.out.endswith("all are equal to the last bit\n")
 
 
 def test_differences_are_listed_with_code_1(
-    curation: Run, told_data: Path, monkeypatch: pytest.MonkeyPatch
+    curation: Run, labelled_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(SCORERS, "peeker", Peeker)
-    told = curation("self-check", told_data, "--json")
-    assert told.code == DIFFERS
-    *differences, last = told.rows
+    done = curation("self-check", labelled_data, "--json")
+    assert done.code == DIFFERS
+    *differences, last = done.rows
     assert last["differences"] == len(differences) >= 5
     assert list(differences[0]) == ["episode", "name", "field", "original", "turned"]
     assert "score/peeker" in {d["field"] for d in differences}
-    told = curation("self-check", told_data)
-    assert told.code == DIFFERS
-    assert "score/peeker" in told.out
-    assert "something reads labels" in told.out
+    done = curation("self-check", labelled_data)
+    assert done.code == DIFFERS
+    assert "score/peeker" in done.out
+    assert "something reads labels" in done.out
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["data"], NOTHING, "there is no label to flip"),
         (["none"], NOTHING, "no folder 'episodes' in it"),
@@ -75,13 +75,13 @@ def test_nothing_to_check_is_one_line_and_a_code(
     monkeypatch: pytest.MonkeyPatch,
     arguments: list[str],
     code: int,
-    said: str,
+    message: str,
 ) -> None:
     monkeypatch.chdir(folder)
     if "--reference" in arguments:
         [bag, *_] = Dataset(folder / "data").bags()
         Dataset(folder / "data").append_truth({"episode": bag.name, "outcome": "failed"})
-    told = curation("self-check", *arguments, "--json")
-    assert (told.code, told.out) == (code, "")
-    assert said in told.err
-    assert "internal error" not in told.err
+    done = curation("self-check", *arguments, "--json")
+    assert (done.code, done.out) == (code, "")
+    assert message in done.err
+    assert "internal error" not in done.err

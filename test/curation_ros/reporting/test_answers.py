@@ -26,7 +26,7 @@ def test_answers_are_few_and_follow_the_data(found: dict[str, Any]) -> None:
     assert "Of 2 planned contrasts 0 are resolved" in " ".join(answers(found))
 
 
-def test_the_best_and_the_worst_policy_of_the_best_detector_are_told_apart(
+def test_best_detector_can_give_the_best_or_the_worst_policy(
     found: dict[str, Any],
 ) -> None:
     rows = [r for r in found["stages"][0]["rows"] if r["scorer"]]

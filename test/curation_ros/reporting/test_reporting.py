@@ -107,14 +107,14 @@ def test_text_in_figures_is_text(report: list[Path]) -> None:
     assert "@font-face" not in text
 
 
-def test_nothing_is_written_for_what_is_no_results(found: dict[str, Any], tmp_path: Path) -> None:
+def test_nothing_is_written_if_these_are_no_results(found: dict[str, Any], tmp_path: Path) -> None:
     found.pop("stages")
     with pytest.raises(ConfigError, match="no key 'stages'"):
         write_report(found, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_without_outcomes_the_report_says_what_is_missing(
+def test_without_outcomes_the_report_names_what_is_missing(
     nothing_done: dict[str, Any], tmp_path: Path
 ) -> None:
     text = html.unescape(write_report(nothing_done, tmp_path)[0].read_text())
@@ -124,10 +124,10 @@ def test_without_outcomes_the_report_says_what_is_missing(
     assert "Missing: data for 2 of 2 contrasts" in text
     assert "Missing: outcomes of stage screening" in text
     assert "policy <x>: it did not converge" in text
-    said = answers(nothing_done)
-    assert f"{n} in stage paper" in said[0]
-    assert "is open" in said[1]
-    assert "2 have no data" in " ".join(said)
+    message = answers(nothing_done)
+    assert f"{n} in stage paper" in message[0]
+    assert "is open" in message[1]
+    assert "2 have no data" in " ".join(message)
 
 
 def test_a_report_without_stages_or_pools_is_written(
@@ -139,8 +139,8 @@ def test_a_report_without_stages_or_pools_is_written(
 
 
 def test_screens_are_marked(found: dict[str, Any], report: list[Path]) -> None:
-    said = " ".join(answers(found))
-    assert "Stage screening (a look, not a claim)" in said
+    message = " ".join(answers(found))
+    assert "Stage screening (a look, not a claim)" in message
     text = report[0].read_text()
     assert "nothing is claimed from them" in text
     assert "screening: paired, relative, 12 kept" in text

@@ -131,7 +131,7 @@ def _nothing_known(e: Episode) -> Episode:
         (_nothing_known, 1, set()),
     ],
 )
-def test_what_a_robot_does_not_have_is_left_out(
+def test_panels_without_data_are_left_out(
     dropped: Episode,
     decision: Decision,
     change: Callable[[Episode], Episode],
@@ -167,7 +167,7 @@ def test_a_person_may_keep_a_span_from_the_middle(dropped: Episode) -> None:
     assert texts_above(heights) == ["cut: kept until 6.00 s", "kept from 2.00 s"]
 
 
-def test_what_is_reviewed_has_no_cut_and_nothing_shaded(dropped: Episode) -> None:
+def test_reviewed_episode_has_no_cut_and_nothing_shaded(dropped: Episode) -> None:
     review = Decision(dropped.id, dropped.name, "review", "no rule", (0, 6_000_000_000))
     heights = drawn(dropped, review)[0]
     assert (lines_across(heights), texts_above(heights), list(heights.patches)) == ([], [], [])

@@ -22,7 +22,7 @@ from curation_ros.reporting.blocks import Figure, Points, Table  # noqa: E402 - 
 from curation_ros.reporting.salvage_section import salvage_blocks  # noqa: E402 - as above
 
 
-def test_a_study_without_such_rows_has_no_section_on_salvage(report: list[Path]) -> None:
+def test_study_without_salvage_rows_has_no_section_on_salvage(report: list[Path]) -> None:
     assert "Salvage</h2>" not in report[0].read_text()
 
 
@@ -31,9 +31,9 @@ def test_salvage_is_shown_against_the_truth(salvaged: dict[str, Any]) -> None:
     [cell] = cells(verdicts)
     assert (cell["keep"], cell["salvage"]) == ("3 good, 0 defective", "0 good, 3 defective")
     assert cell["cut minus release, steps"] == "-15 / -15 / -15"
-    [said] = [text for text in answers(salvaged) if "salvages" in text]
-    assert "keeps 3 of 3 good demonstrations and 0 of 3 defective ones" in said
-    assert "a beginning of 0 and 3." in said
+    [message] = [text for text in answers(salvaged) if "salvages" in text]
+    assert "keeps 3 of 3 good demonstrations and 0 of 3 defective ones" in message
+    assert "a beginning of 0 and 3." in message
 
 
 def test_the_margin_sweep_is_drawn_and_listed(salvaged: dict[str, Any]) -> None:
@@ -81,9 +81,7 @@ def test_one_salvaged_episode_is_drawn(salvaged: dict[str, Any], tmp_path: Path)
     assert len(page.encode()) < MOST_BYTES
 
 
-def test_an_example_that_is_none_is_refused_in_a_line(
-    salvaged: dict[str, Any], tmp_path: Path
-) -> None:
+def test_broken_example_is_refused_in_one_line(salvaged: dict[str, Any], tmp_path: Path) -> None:
     spoilt = deepcopy(salvaged)
     spoilt["salvaged_example"]["decision"].pop("span")
     with pytest.raises(ConfigError, match="salvaged_example: EpisodeError: decision: KeyError"):

@@ -42,7 +42,7 @@ def test_every_row_of_every_stage_is_shown_with_its_figures(found: dict[str, Any
                 assert same(cell["rival"].rpartition(": ")[2], row["rival"]["difference"], 100)
 
 
-def test_table_1_has_the_audit_beside_the_paper(found: dict[str, Any]) -> None:
+def test_table_1_compares_the_audit_with_the_paper(found: dict[str, Any]) -> None:
     audited = found["pools"]["paired"]["audit"]
     shown = list(cells(tables.table_1(found, "paired")))
     assert len(shown) == len(audited)
@@ -58,7 +58,7 @@ def test_table_1_has_the_audit_beside_the_paper(found: dict[str, Any]) -> None:
             assert same(cell["paper joined"], row["paper"]["truncated_joined_by_name"])
 
 
-def test_table_2_has_both_variants_beside_the_paper(found: dict[str, Any]) -> None:
+def test_table_2_compares_both_variants_with_the_paper(found: dict[str, Any]) -> None:
     stage = stage_of(found, "paper")
     shown = {cell["condition"]: cell for cell in cells(tables.table_2(found, stage, "paired"))}
     assert next(iter(shown)) == "oracle"
@@ -75,7 +75,7 @@ def test_table_2_has_both_variants_beside_the_paper(found: dict[str, Any]) -> No
         assert same(cell["paper joined"], paper.joined)
 
 
-def test_correlations_are_shown_and_the_papers_own(found: dict[str, Any]) -> None:
+def test_correlations_are_shown_with_those_of_the_paper(found: dict[str, Any]) -> None:
     stage = stage_of(found, "paper")
     shown = list(cells(tables.correlations(stage) or pytest.fail("there are some")))
     assert len(shown) == len(stage["correlations"]) + 2

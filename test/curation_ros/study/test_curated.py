@@ -31,7 +31,7 @@ def test_facts_are_decisions_against_the_truth(pool: Pool) -> None:
     )
 
 
-def test_an_example_is_the_first_by_name_of_those_that_broke(pool: Pool) -> None:
+def test_example_is_the_first_salvaged_episode_by_name(pool: Pool) -> None:
     assert pool.curated is not None
     assert pool.curated.example is not None
     assert pool.curated.example.id == "a-2"

@@ -44,7 +44,7 @@ def changed(change: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", ["paper", "question", "salvage"])
-def test_the_plans_of_the_repository_are_whole(name: str) -> None:
+def test_plans_of_the_repository_are_valid(name: str) -> None:
     plan = read_plan(CONFIG / f"{name}.yaml")
     assert plan.name == name
     assert all(stage.cells() for stage in plan.stages)
@@ -58,7 +58,7 @@ def test_the_paper_protocol_is_that_of_the_paper() -> None:
     assert len(stage.cells()) == 2 * 2 * 10
 
 
-def test_rows_in_braces_are_several() -> None:
+def test_braces_expand_to_several_rows() -> None:
     [stage] = plan_from(RAW).stages
     assert stage.rows[:3] == ("everything", "knn@2", "knn@3")
     assert stage.rows[3:] == tuple(f"random@2#{k}" for k in range(4))
@@ -67,7 +67,7 @@ def test_rows_in_braces_are_several() -> None:
     assert stage.seeds_of("random@2") == stage.seeds_of("knn@2") == (1, 2, 3)
 
 
-def test_sets_of_contrasts_are_worked_on_and_none_twice() -> None:
+def test_sets_of_contrasts_are_cells_and_none_is_there_twice() -> None:
     contrast = {"a": "knn@2", "b": "reference", "pool": "paired", "variant": "relative"}
     raw = changed(lambda r: r["stages"][0].update(contrasts=[contrast]))
     cells = plan_from(raw).stages[0].cells()
@@ -76,7 +76,7 @@ def test_sets_of_contrasts_are_worked_on_and_none_twice() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda r: r.pop("pools"), "plan: no key 'pools'"),
         (lambda r: r.update(speed=3), "unknown key 'speed'; known are name, question"),
@@ -104,35 +104,35 @@ def test_sets_of_contrasts_are_worked_on_and_none_twice() -> None:
         (lambda r: r["pools"].update(more={"episodes": 2}), "a pool cannot be called 'more'"),
     ],
 )
-def test_plans_that_make_no_sense_are_refused(
-    tmp_path: Path, change: Callable[[dict[str, Any]], None], said: str
+def test_invalid_plans_are_refused(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], message: str
 ) -> None:
     path = tmp_path / "plan.yaml"
     path.write_text(yaml.safe_dump(changed(change)))
-    with pytest.raises(ConfigError, match=said) as caught:
+    with pytest.raises(ConfigError, match=message) as caught:
         read_plan(path)
     assert str(path) in str(caught.value)
 
 
-def test_more_contrasts_than_were_to_be_planned_are_refused() -> None:
+def test_too_many_contrasts_are_refused() -> None:
     one = {"a": "oracle", "b": "everything", "pool": "paired", "variant": "relative"}
     with pytest.raises(ConfigError, match="13 contrasts, at most 12"):
         plan_from(changed(lambda r: r["stages"][0].update(contrasts=[one] * 13)))
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("a: [", "is not YAML, line 1"),
         ("- 1", "expected a mapping"),
         (None, "No such file"),
     ],
 )
-def test_files_that_are_no_plan_are_named(tmp_path: Path, text: str | None, said: str) -> None:
+def test_files_without_a_plan_are_named(tmp_path: Path, text: str | None, message: str) -> None:
     path = tmp_path / "plan.yaml"
     if text is not None:
         path.write_text(text)
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         read_plan(path)
 
 
@@ -145,7 +145,7 @@ def test_every_change_of_a_plan_changes_its_hash() -> None:
     assert plan_from(RAW).hash == plan_from(deepcopy(RAW)).hash != plan_from(other).hash
 
 
-def test_the_contrasts_of_salvage_are_twelve_and_the_margin_is_looked_for_before() -> None:
+def test_salvage_plan_chooses_the_margin_before_its_twelve_contrasts() -> None:
     margins, confirmation = read_plan(CONFIG / "salvage.yaml").stages
     assert (margins.kind, len(margins.contrasts)) == ("screen", 0)
     assert (confirmation.kind, len(confirmation.contrasts)) == ("confirm", 12)
@@ -156,7 +156,7 @@ def test_the_contrasts_of_salvage_are_twelve_and_the_margin_is_looked_for_before
     assert pools == ["independent_16", "independent_6", "paired_16", "paired_6"]
 
 
-def test_some_stages_of_a_plan_are_these_and_what_they_use() -> None:
+def test_plan_with_only_some_stages_has_only_their_pools() -> None:
     plan = read_plan(CONFIG / "salvage.yaml")
     some = plan.only(["margins"])
     assert [stage.name for stage in some.stages] == ["margins"]

@@ -42,7 +42,7 @@ def found(_made: dict[str, Any]) -> dict[str, Any]:
         (lambda r: r["stages"].append(7), "stage: expected a mapping, found 7"),
     ],
 )
-def test_what_is_no_results_is_refused_in_a_line(
+def test_wrong_results_are_refused_in_one_line(
     found: dict[str, Any], spoil: Any, complaint: str
 ) -> None:
     check_results(found)

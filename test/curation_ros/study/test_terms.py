@@ -21,7 +21,7 @@ def test_rows_are_read_term_by_term() -> None:
 
 
 @pytest.mark.parametrize(
-    ("row", "said"),
+    ("row", "message"),
     [
         ("knn", "knn needs a number to keep"),
         ("knn@0", "knn needs a number to keep"),
@@ -38,6 +38,6 @@ def test_rows_are_read_term_by_term() -> None:
         ("knn@16+", "unknown term ''"),
     ],
 )
-def test_rows_that_make_no_sense_are_named(row: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_invalid_rows_are_named(row: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         parse_row(row)

@@ -49,7 +49,7 @@ def last_steps(pool: Pool, made: TrainingSet) -> dict[str, int]:
     }
 
 
-def test_what_is_decided_is_whole_and_what_broke_is_salvaged(
+def test_kept_episodes_are_whole_and_broken_ones_are_salvaged(
     pool: Pool, reference: Dataset
 ) -> None:
     whole = training_set(pool, "decided", reference, 0)
@@ -63,14 +63,14 @@ def test_what_is_decided_is_whole_and_what_broke_is_salvaged(
 
 
 @pytest.mark.parametrize("margin", MARGINS)
-def test_a_margin_is_so_many_control_steps(pool: Pool, reference: Dataset, margin: int) -> None:
+def test_margin_counts_control_steps(pool: Pool, reference: Dataset, margin: int) -> None:
     made = training_set(pool, f"salvaged-{margin}", reference, 0)
     # Something is kept away from the break even without a margin: the step of the break itself.
     ends = [at - max(1, margin) for at in DROPS]
     assert list(last_steps(pool, made).values()) == ends
 
 
-def test_sets_that_hold_the_same_have_one_id(pool: Pool, reference: Dataset) -> None:
+def test_equal_sets_have_one_id(pool: Pool, reference: Dataset) -> None:
     def id_of(row: str) -> str:
         return training_set(pool, row, reference, 0).id
 
@@ -80,7 +80,7 @@ def test_sets_that_hold_the_same_have_one_id(pool: Pool, reference: Dataset) -> 
     assert len(ids) == 4
 
 
-def test_a_demonstration_that_two_terms_show_is_there_once_and_longer(
+def test_demonstration_of_two_terms_is_there_once_with_its_longer_part(
     pool: Pool, reference: Dataset
 ) -> None:
     for row in ("salvaged-15+salvaged-0", "salvaged-0+salvaged-15"):
@@ -91,7 +91,7 @@ def test_a_demonstration_that_two_terms_show_is_there_once_and_longer(
         assert made.id == training_set(pool, "everything", reference, 0).id
 
 
-def test_random_cuts_are_those_of_the_seed_and_of_the_names(
+def test_random_cuts_depend_on_seed_and_names_only(
     pool: Pool, reference: Dataset, tmp_path: Path
 ) -> None:
     def cuts(pool: Pool, draw: int) -> list[int]:
@@ -118,7 +118,9 @@ def test_random_cuts_are_those_of_the_seed_and_of_the_names(
     assert by_name == list(drawn[3])
 
 
-def test_more_are_the_first_that_succeeded(pool: Pool, reference: Dataset, more: Dataset) -> None:
+def test_more_takes_the_first_that_succeeded(
+    pool: Pool, reference: Dataset, more: Dataset
+) -> None:
     made = training_set(pool, "oracle+more@2", reference, 0, more=more)
     assert set(spans(made)) == {"a-0", "a-1", "z-9", "z-7"}
     assert (made.n_pool, made.n_good, made.n_more) == (2, 2, 2)
@@ -149,7 +151,7 @@ def test_without_poses_gripper_and_phase_decide_and_nothing_is_needed(
     assert (made.n_pool, made.n_salvaged) == (5, 3)
 
 
-def test_a_beginning_that_is_too_short_with_a_margin_is_there_with_a_smaller_one(
+def test_too_short_a_beginning_is_left_out_unless_the_margin_is_smaller(
     tmp_path: Path, reference: Dataset
 ) -> None:
     pool = pool_of(tmp_path, scenes_of(), (0, 80))
@@ -157,6 +159,6 @@ def test_a_beginning_that_is_too_short_with_a_margin_is_there_with_a_smaller_one
     assert training_set(pool, "salvaged-80", reference, 0).n_salvaged < 3
 
 
-def test_a_pool_that_the_curator_has_not_seen_is_named(pool: Pool, reference: Dataset) -> None:
+def test_pool_without_decisions_is_named(pool: Pool, reference: Dataset) -> None:
     with pytest.raises(EpisodeError, match="pool 'made': the curator has not decided"):
         training_set(replace(pool, curated=None), "decided", reference, 0)

@@ -69,7 +69,7 @@ def test_auroc_is_that_of_scikit_learn(data: tuple[list[float], list[bool]]) -> 
 
 
 @given(scored)
-def test_auroc_mirrors_when_labels_or_scores_are_turned(
+def test_auroc_mirrors_when_labels_or_scores_are_flipped(
     data: tuple[list[float], list[bool]],
 ) -> None:
     scores, good = data
@@ -83,7 +83,7 @@ def test_constant_score_is_chance() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scores", "good", "said"),
+    ("scores", "good", "message"),
     [
         ([1.0, 2.0], [True, True], "2 of 2 are good"),
         ([1.0, 2.0], [False, False], "0 of 2 are good"),
@@ -92,9 +92,9 @@ def test_constant_score_is_chance() -> None:
         ([], [], "0 of 0 are good"),
     ],
 )
-def test_wrong_input_raises(scores: list[float], good: list[bool], said: str) -> None:
+def test_wrong_input_raises(scores: list[float], good: list[bool], message: str) -> None:
     for figure in (auroc, partial_auroc):
-        with pytest.raises(ConfigError, match=said):
+        with pytest.raises(ConfigError, match=message):
             figure(scores, good)
 
 
@@ -153,7 +153,7 @@ def test_interval_of_nonsense_raises(bad: tuple[float, int, int]) -> None:
 
 @pytest.mark.parametrize("true_auroc", [0.5, 0.638, 0.8, 0.95, 0.99])
 @pytest.mark.parametrize("step", [0.0, 1.0], ids=["continuous", "tied"])
-def test_interval_covers_what_it_says(
+def test_interval_has_its_nominal_coverage(
     rng: np.random.Generator, true_auroc: float, step: float
 ) -> None:
     m, n, draws = 16, 64, 2000
@@ -209,7 +209,7 @@ def test_interval_over_starts_is_that_of_a_plain_resampling(rng: np.random.Gener
     assert again == found
 
 
-def test_interval_over_starts_says_nothing_where_it_cannot() -> None:
+def test_interval_over_starts_is_none_without_information() -> None:
     scores, good = [2.0, 2.0, 1.0, 1.0], [True, True, False, False]
     assert auroc_interval_over_clusters(scores, good, ["a", "b", "c", "d"]) is None
     assert auroc_interval_over_clusters(scores, good, ["a", "a", "a", "a"]) is None

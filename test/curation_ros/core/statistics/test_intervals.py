@@ -59,7 +59,7 @@ def test_more_trials_or_less_confidence_narrow_it(interval: Interval) -> None:
     assert width(27, 30, 0.8) < width(27, 30)
 
 
-def test_clopper_pearson_covers_what_it_says() -> None:
+def test_clopper_pearson_has_at_least_its_nominal_coverage() -> None:
     n = 30
     for p in (0.03, 0.5, 0.9, 0.97):
         covered = sum(

@@ -55,7 +55,7 @@ def test_labels_within_strata_by_hand() -> None:
     assert found.p == pytest.approx(share, abs=0.05)
 
 
-def test_score_that_only_follows_length_tells_nothing_within_strata(
+def test_score_that_only_follows_length_detects_nothing_within_strata(
     rng: np.random.Generator,
 ) -> None:
     good = rng.random(300) < 0.5

@@ -10,7 +10,7 @@ from curation_ros.core.errors import ConfigError
 from curation_ros.core.statistics.success import contrast, gap_closed, success_rate
 
 
-def test_contrast_pairs_by_key_and_counts_what_has_no_partner() -> None:
+def test_contrast_pairs_by_key_and_counts_unpaired_outcomes() -> None:
     a, b = outcomes([[1, 1, 0], [1, 0, 1]]), outcomes([[0, 1, 0], [0, 0, 1]])
     backwards = dict(reversed(b.items()))
     del backwards[(1, "start-2")]
@@ -21,7 +21,7 @@ def test_contrast_pairs_by_key_and_counts_what_has_no_partner() -> None:
         contrast(a, {(9, "start-0"): True})
 
 
-def test_floor_of_p_is_the_least_that_so_many_seeds_can_give() -> None:
+def test_floor_of_p_is_the_smallest_possible_with_these_seeds() -> None:
     found = contrast(outcomes([[1]] * 3), outcomes([[0]] * 3))
     assert found.p == found.p_floor == 0.25
 
@@ -35,7 +35,7 @@ def test_equal_conditions_give_no_zero_width_and_p_one() -> None:
     assert found.p == 1.0
 
 
-def test_bound_at_no_success_is_one_rollout_a_seed() -> None:
+def test_bound_without_success_assumes_one_rollout_per_seed() -> None:
     found = success_rate(outcomes([[0] * 30] * 3))
     assert found.interval == (0.0, pytest.approx(1 - 0.025 ** (1 / 3)))
     assert success_rate(outcomes([[1] * 5])).interval is None  # one seed tells of no other
