@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from one_core import rows_of
 
+from curation_ros.configuration import topic_map_or_default
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.episodes import read_episode
 from curation_ros.study.collect import Collection, collect
@@ -75,6 +76,8 @@ _DEMONSTRATIONS = Collection(
 #: With the noise that few demonstrations need.
 _SETTINGS = TrainingSettings(steps=3000, start_jitter_m=0.004)
 
+TOPIC_MAP = topic_map_or_default("")
+
 Floats = NDArray[np.float64]
 
 
@@ -85,13 +88,13 @@ class Pair:
     Attributes:
         kind: who acts.
         start: where.
-        controller: makes a fresh one.
+        controller: makes a fresh one for an environment.
         steps_after_success: as demonstrations or rollouts have it.
     """
 
     kind: str
     start: Start
-    controller: Callable[[], Controller]
+    controller: Callable[[LiberoEnv], Controller]
     steps_after_success: int
 
 
@@ -138,7 +141,7 @@ def recorded_states(env: LiberoEnv, start: Start, policy: Policy) -> list[Floats
         mujoco.mj_getState(env.model, env.data, states[-1], kind)
 
     limits = EpisodeLimits(steps_after_success=0)
-    run_episode(env, TASK, start, SimController(policy), limits, on_step=remember)
+    run_episode(env, TASK, start, SimController(policy, env, TOPIC_MAP), limits, on_step=remember)
     return states
 
 
@@ -157,7 +160,7 @@ def bare_rate(model: mujoco.MjModel, data: mujoco.MjData, states: list[Floats]) 
 def loop_rate(env: LiberoEnv, start: Start, policy: Policy, max_steps: int = MAX_STEPS) -> float:
     """Steps a second of a rollout, its reset not counted."""
     started_s = time.perf_counter()
-    done = rollout(env, TASK, start, policy, max_steps)
+    done = rollout(env, TASK, start, policy, TOPIC_MAP, max_steps)
     return done.steps / (time.perf_counter() - started_s - env.reset_s)
 
 
@@ -227,9 +230,14 @@ def n_compiled() -> int:
     return int(done.stdout)
 
 
-def scripted(defect: Defect, seed: int) -> Controller:
+def scripted(defect: Defect, seed: int, _: LiberoEnv) -> Controller:
     """An expert with a defect."""
     return defect.inject(TASK.expert(seed), TASK, seed)
+
+
+def driven_by(policy: Policy, env: LiberoEnv) -> Controller:
+    """A policy that observes an environment."""
+    return SimController(policy, env, TOPIC_MAP)
 
 
 def pairs(clean: Policy, contaminated: Policy) -> Iterator[Pair]:
@@ -247,7 +255,7 @@ def pairs(clean: Policy, contaminated: Policy) -> Iterator[Pair]:
             yield Pair(
                 kind,
                 TASK.start(official_name(k)),
-                partial(SimController, policy),
+                partial(driven_by, policy),
                 steps_after_success=0,
             )
 
@@ -265,7 +273,7 @@ def run_pair(env: LiberoEnv, pair: Pair) -> Run:
         env,
         TASK,
         pair.start,
-        pair.controller(),
+        pair.controller(env),
         EpisodeLimits(MAX_STEPS, pair.steps_after_success),
         on_step=remember,
     )

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from curation_ros.batch.workers import spread
+from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.statistics.intervals import clopper_pearson
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.episodes import read_episode
@@ -63,9 +64,10 @@ def watch(policy: Path, start: str) -> dict[str, Any]:
         if why and not said:
             said.append((step.index, why))
 
-    controller = SimController(load_policy(policy))
+    env = process_environment(task.name)
+    controller = SimController(load_policy(policy), env, topic_map_or_default(""))
     ended = run_episode(
-        process_environment(task.name),
+        env,
         task,
         task.start(start),
         controller,

@@ -31,6 +31,7 @@ from recorded import record
 from rows import row
 from sensor_msgs.msg import JointState
 
+from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.episode.status import phase_to_status
 from curation_ros.core.episode.stream import header_stamp_ns
 from curation_ros.core.types import NS_PER_S
@@ -161,13 +162,14 @@ def _in_process(policy: Any, starts: str) -> list[Any]:
 
     times = []
     task = TASKS[SIMULATED_TASK]
+    env = process_environment(task.name)
     for start in start_names(starts):
         clock: list[float] = []
         run_episode(
-            process_environment(task.name),
+            env,
             task,
             task.start(start),
-            SimController(policy),
+            SimController(policy, env, topic_map_or_default("")),
             EpisodeLimits(MAX_STEPS, steps_after_success=0),
             on_step=lambda *_, clock=clock: clock.append(time.perf_counter()),
         )

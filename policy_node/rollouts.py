@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.types import Floats
 from policy_node.controller import PolicyController
 from policy_node.policy import Policy
-from sim_node.environment import Environment, Observation
+from sim_node.environment import Environment
 from sim_node.episodes import run_episode
+from sim_node.fields import CommandedFields, ObservedFields
 from sim_node.settings import MAX_STEPS, EpisodeLimits
 from sim_node.starts import Start
-from sim_node.tasks.bowl_on_plate import BOWL, PLATE
 from sim_node.tasks.task import Step, Task
 
 
@@ -44,34 +45,33 @@ class Rollout:
         return {key: value for key, value in asdict(self).items() if key != "ended"}
 
 
-def field_values(observation: Observation) -> dict[str, Floats]:
-    """What the simulator shows, by the fields of the topic map; lengths in m, angles in rad."""
-    return {
-        "eef_position": observation.eef_position_m,
-        "eef_quat_xyzw": observation.eef_quat_xyzw,
-        "joint_position": observation.joint_position_rad,
-        "finger_position": observation.finger_position_m,
-        "bowl_position": observation.objects[BOWL][0],
-        "plate_position": observation.objects[PLATE][0],
-    }
-
-
 class SimController:
-    """A policy in the shape that `run_episode` drives; for one episode."""
+    """A policy in the shape that `run_episode` drives; for one episode.
 
-    def __init__(self, policy: Policy) -> None:
+    Args:
+        policy: what acts. It is reset, and must drive nothing else meanwhile.
+        env: the environment that it observes.
+        topic_map: says which of its fields is which value of which topic.
+
+    Raises:
+        ConfigError: if the simulated robot does not send or take one of its fields.
+    """
+
+    def __init__(self, policy: Policy, env: Environment, topic_map: TopicMap) -> None:
         self._controller = PolicyController(policy)
+        self._observed = ObservedFields(env, topic_map, policy.observed)
+        self._commanded = CommandedFields(topic_map, policy.commanded)
 
     def act(self, step: Step) -> tuple[Floats, float]:
         """(3,) twist and the gripper's command, each in [-1, 1].
 
+        A policy that does not command the gripper leaves it as it is.
+
         Raises:
             PolicyError: if the policy cannot answer the observation.
         """
-        values = {**field_values(step.observation), "phase": np.array([float(step.phase_index)])}
-        command = self._controller.answer(step.index, values)
-        # A policy that was trained without a gripper leaves it as it is.
-        return command["twist"], float(command["gripper"][0]) if "gripper" in command else 0.0
+        command = self._controller.answer(step.index, self._observed.values(step))
+        return self._commanded.command(command)
 
 
 class GiveUp:
@@ -131,6 +131,7 @@ def rollout(
     task: Task,
     start: Start,
     policy: Policy,
+    topic_map: TopicMap,
     max_steps: int = MAX_STEPS,
     *,
     gives_up: bool = False,
@@ -142,11 +143,13 @@ def rollout(
         task: what is to be done in it.
         start: where to start.
         policy: what acts.
+        topic_map: says which field is which value of which topic.
         max_steps: most commands.
         gives_up: whether a rollout that is as good as lost is ended, see `GiveUp`.
 
     Raises:
-        ConfigError: if max_steps is not positive.
+        ConfigError: if max_steps is not positive, or the simulated robot does not send or take a
+            field of the policy.
         PolicyError: if the policy cannot answer an observation.
         SimError: if the simulation diverged.
     """
@@ -154,7 +157,7 @@ def rollout(
         env,
         task,
         start,
-        SimController(policy),
+        SimController(policy, env, topic_map),
         EpisodeLimits(max_steps, steps_after_success=0),
         give_up=GiveUp(task) if gives_up else None,
     )

@@ -28,36 +28,40 @@ class RobotMessages:
 
     def __init__(self, env: Environment) -> None:
         self._joint_names = tuple(env.joint_names)
-        self._object_topics = {name: f"objects/{name}/pose" for name in env.object_names}
+        self._objects = {f"objects/{name}/pose": name for name in env.object_names}
         self.types = {
             "joint_states": messages.JOINT_STATE,
-            "eef_pose": messages.POSE,
+            **dict.fromkeys(self._objects, messages.POSE),
             "phase": messages.STATUS_ARRAY,
-            **dict.fromkeys(self._object_topics.values(), messages.POSE),
+            # The topic with role clock goes last: once it arrives, the rest usually has, too.
+            "eef_pose": messages.POSE,
         }
 
     def observation(self, stamp_ns: int, step: Step, episode_id: str) -> Iterator[PlainMessage]:
         """Everything that is observed at one stamp, the clock first."""
-        o = step.observation
         yield PlainMessage(CLOCK_TOPIC, messages.CLOCK, messages.clock(stamp_ns))
-        joints = messages.joint_state(
-            self._joint_names,
-            [*o.joint_position_rad, *o.finger_position_m],
-            [*o.joint_velocity_rad_s, *o.finger_velocity_m_s],
-            [*o.joint_effort_nm, *o.finger_effort_n],
-            stamp_ns,
-        )
-        yield PlainMessage("joint_states", messages.JOINT_STATE, joints)
-        for name, topic in self._object_topics.items():
-            pose = messages.pose(*o.objects[name], stamp_ns)
-            yield PlainMessage(topic, messages.POSE, pose)
-        phase = phase_to_status(episode_id, step.phase_name, step.phase_index, step.phase_progress)
-        yield PlainMessage(
-            "phase", messages.STATUS_ARRAY, messages.status_array([phase], stamp_ns)
-        )
-        # The topic with role clock goes last: once it arrives, the rest usually has, too.
-        effector = messages.pose(o.eef_position_m, o.eef_quat_xyzw, stamp_ns)
-        yield PlainMessage("eef_pose", messages.POSE, effector)
+        for topic, kind in self.types.items():
+            yield PlainMessage(topic, kind, self.content(topic, stamp_ns, step, episode_id))
+
+    def content(self, topic: str, stamp_ns: int, step: Step, episode_id: str) -> messages.Content:
+        """The message of one of `types`."""
+        o = step.observation
+        if topic == "eef_pose":
+            return messages.pose(o.eef_position_m, o.eef_quat_xyzw, stamp_ns)
+        if topic == "joint_states":
+            return messages.joint_state(
+                self._joint_names,
+                [*o.joint_position_rad, *o.finger_position_m],
+                [*o.joint_velocity_rad_s, *o.finger_velocity_m_s],
+                [*o.joint_effort_nm, *o.finger_effort_n],
+                stamp_ns,
+            )
+        if topic == "phase":
+            phase = phase_to_status(
+                episode_id, step.phase_name, step.phase_index, step.phase_progress
+            )
+            return messages.status_array([phase], stamp_ns)
+        return messages.pose(*o.objects[self._objects[topic]], stamp_ns)
 
 
 def command_messages(stamp_ns: int, command: Command) -> Iterator[PlainMessage]:

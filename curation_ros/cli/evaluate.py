@@ -15,7 +15,7 @@ from curation_ros.cli.output import percent, print_json, progress_console, say
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.errors import ConfigError
 from curation_ros.nodes.evaluate import evaluate_on_graph, summary
-from sim_node.settings import MAX_STEPS
+from sim_node.settings import MAX_STEPS, SIMULATED_TASK
 
 _MOST_STEPS = 100_000  # the limit of sim_node
 
@@ -27,7 +27,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--starts", default="official:0:50", help="official:FIRST:END or generated:SEED:COUNT"
     )
     parser.add_argument(
-        "--max-steps", type=int, default=MAX_STEPS, help="then a rollout has failed"
+        "--simulated-task",
+        default=SIMULATED_TASK,
+        metavar="NAME",
+        help=f"what is simulated, a file of sim_node/tasks (default: {SIMULATED_TASK})",
+    )
+    parser.add_argument(
+        "--max-steps",
+        type=int,
+        default=MAX_STEPS,
+        help=f"most commands of a rollout (default: {MAX_STEPS})",
+    )
+    parser.add_argument(
+        "--topic-map", default="", metavar="FILE", help="default: the LIBERO robot of sim_node"
     )
     parser.add_argument(
         "--graph", action="store_true", help="drive sim_node and policy_node over ROS 2"
@@ -43,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     if not 1 <= args.max_steps <= _MOST_STEPS:
         raise ConfigError(f"--max-steps {args.max_steps}: expected 1 to {_MOST_STEPS}")
     policy = load_policy(args.policy)
-    policy.check(topic_map_or_default(""))
+    policy.check(topic_map_or_default(args.topic_map))
     rows = []
     for row in _rollouts(args, policy.card.id):
         rows.append(row)
@@ -68,7 +80,13 @@ def _rollouts(args: argparse.Namespace, policy_id: str) -> Iterator[dict[str, An
             text = f"starting sim_node and policy_node; their logs are in {logs}"
             progress_console.print(text, markup=False, soft_wrap=True)
         yield from evaluate_on_graph(
-            args.policy, policy_id, args.starts, max_steps=args.max_steps, log_folder=logs
+            args.policy,
+            policy_id,
+            args.starts,
+            max_steps=args.max_steps,
+            simulated_task=args.simulated_task,
+            topic_map=args.topic_map,
+            log_folder=logs,
         )
         if args.logs is None:  # after an error they stay, for its message names them
             shutil.rmtree(logs, ignore_errors=True)
@@ -76,6 +94,9 @@ def _rollouts(args: argparse.Namespace, policy_id: str) -> Iterator[dict[str, An
     from curation_ros.study.unit_work import roll_policy
     from sim_node.tasks import start_names
 
-    tasks = [(args.policy, name, args.max_steps) for name in start_names(args.starts)]
-    for done in spread(roll_policy, tasks, jobs=args.jobs, backend=args.backend):
+    rollouts = [
+        (args.policy, start, args.max_steps, args.simulated_task, args.topic_map)
+        for start in start_names(args.starts, args.simulated_task)
+    ]
+    for done in spread(roll_policy, rollouts, jobs=args.jobs, backend=args.backend):
         yield done.to_json()

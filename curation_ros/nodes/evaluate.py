@@ -14,6 +14,8 @@ from curation_ros.core.errors import CurationError
 from curation_ros.core.statistics.intervals import wilson
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.nodes.processes import Domain, Nodes
+from sim_node.settings import MAX_STEPS, SIMULATED_TASK
+from sim_node.tasks import start_names
 
 # A step takes milliseconds: without a finished rollout for this long, something hangs.
 _SILENCE_S = 120.0
@@ -27,7 +29,9 @@ def evaluate_on_graph(
     policy_id: str,
     starts: str,
     *,
-    max_steps: int | None = None,
+    max_steps: int = MAX_STEPS,
+    simulated_task: str = SIMULATED_TASK,
+    topic_map: str = "",
     log_folder: Path,
     stop: threading.Event | None = None,
 ) -> Iterator[dict[str, Any]]:
@@ -37,7 +41,9 @@ def evaluate_on_graph(
         policy: folder of the policy.
         policy_id: for the rows.
         starts: as sim_node's parameter `starts`, such as official:0:10.
-        max_steps: after so many steps a rollout has failed; None: the default of sim_node.
+        max_steps: most commands of a rollout.
+        simulated_task: key of `sim_node.tasks.TASKS`.
+        topic_map: YAML file of the topic map; empty: the default one.
         log_folder: for the nodes' logs.
         stop: ends the evaluation early when another thread sets it.
 
@@ -48,8 +54,8 @@ def evaluate_on_graph(
         CurationError: if a node ends or hangs, or a rollout was not driven to its end. None of
             these is a failure of the policy.
     """
-    n = count_starts(starts)
-    settings = _sim_settings(starts, n, max_steps)
+    n = len(start_names(starts, simulated_task))
+    settings = _sim_settings(simulated_task, starts, n, max_steps)
     domain = Domain()
     with (
         tempfile.TemporaryDirectory(prefix="curation_ros-evaluate-") as folder,
@@ -57,7 +63,7 @@ def evaluate_on_graph(
     ):
         truth_log = Dataset(folder, create=True).truth_log
         try:
-            nodes.start("policy_node", {"policy": policy})
+            nodes.start("policy_node", {"policy": policy, "topic_map": topic_map})
             nodes.start("sim_node", {**settings, "dataset": folder})
             n_done, last_s = 0, time.monotonic()
             while n_done < n and not (stop is not None and stop.is_set()):
@@ -77,14 +83,15 @@ def evaluate_on_graph(
             domain.close()
 
 
-def _sim_settings(starts: str, n: int, max_steps: int | None) -> dict[str, Any]:
+def _sim_settings(simulated_task: str, starts: str, n: int, max_steps: int) -> dict[str, Any]:
     """Parameters of sim_node for rollouts of a policy, apart from the dataset."""
     return {
         "mode": "command",
+        "simulated_task": simulated_task,
         "episodes": n,
         "starts": starts,
         "task": "rollout",
-        **({} if max_steps is None else {"max_steps": max_steps}),
+        "max_steps": max_steps,
         "steps_after_success": 0,
         "command_timeout_s": _ANSWER_S,
         "wait_for": ["policy_node"],
@@ -110,17 +117,6 @@ def _check_silence(silence_s: float, log_folder: Path) -> None:
         raise CurationError(
             f"no rollout has ended for {_SILENCE_S:g} s: see {log_folder}/sim_node.log"
         )
-
-
-def count_starts(spec: str) -> int:
-    """Number of starts of a specification such as official:0:50; none of them is built.
-
-    Raises:
-        CurationError: if it is no specification.
-    """
-    from sim_node.tasks import start_names
-
-    return len(start_names(spec))
 
 
 def summary(policy_id: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

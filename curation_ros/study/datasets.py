@@ -38,7 +38,7 @@ def collect_datasets(
     check_starts(plan)
     datasets, n_new = {}, 0
     for name, settings in plan.collections.items():
-        collection = _collection(settings, name)
+        collection = _collection(plan, settings, name)
         problems, n_known, n = [], 0, 0
         for one in collect(folder / name, collection, jobs=jobs, backend=backend):
             n += 1
@@ -65,13 +65,13 @@ def check_starts(plan: StudyPlan) -> None:
 
     used: dict[str, str] = {}
     for name, settings in plan.collections.items():
-        for episode in _collection(settings, name).plan().values():
+        for episode in _collection(plan, settings, name).plan().values():
             owner = used.setdefault(episode.start, name)
             if owner != name:
                 raise ConfigError(f"start {episode.start} is used by {owner} and by {name}")
     kinds: dict[str, str] = {}
     for stage in plan.stages:
-        for start in start_names(stage.starts):
+        for start in start_names(stage.starts, plan.simulated_task):
             if start in used:
                 raise ConfigError(
                     f"stage {stage.name!r}: start {start} is one of dataset {used[start]!r}"
@@ -82,10 +82,11 @@ def check_starts(plan: StudyPlan) -> None:
                 )
 
 
-def _collection(settings: Mapping[str, Any], name: str) -> Collection:
+def _collection(plan: StudyPlan, settings: Mapping[str, Any], name: str) -> Collection:
     from curation_ros.study.collect import Collection
 
+    shared = {"simulated_task": plan.simulated_task, "topic_map": plan.topic_map}
     try:
-        return Collection.from_settings(settings)
+        return Collection.from_settings({**shared, **settings})
     except ConfigError as err:
         raise ConfigError(f"dataset {name!r}: {err}") from err

@@ -15,7 +15,7 @@ from curation_ros.core.scorers import SCORERS, find_scorer, is_scorer
 from curation_ros.core.yaml_file import read_yaml
 from curation_ros.study.terms import Term, parse_row
 from policy_node.settings import DEFAULTS
-from sim_node.settings import MAX_STEPS
+from sim_node.settings import MAX_STEPS, SIMULATED_TASK
 
 #: What a stage is for. Results of `screen` are for exploring; nothing is claimed from them.
 KINDS = ("protocol", "screen", "confirm")
@@ -105,6 +105,8 @@ class StudyPlan:
         selection_seed: seed of ties and of the controls.
         looks_before: earlier looks at results on the official starts, a line each.
         more: parameters of the collection of further clean demonstrations; empty for none.
+        simulated_task: task of collections and rollouts, a key of `sim_node.tasks.TASKS`.
+        topic_map: YAML file of the topic map of collections and rollouts; empty: the default one.
         raw: the plan as it was written.
     """
 
@@ -124,6 +126,8 @@ class StudyPlan:
     selection_seed: int = 0
     looks_before: tuple[str, ...] = ()
     more: Mapping[str, Any] = field(default_factory=dict)
+    simulated_task: str = SIMULATED_TASK
+    topic_map: str = ""
     raw: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
     @property

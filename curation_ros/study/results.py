@@ -144,7 +144,7 @@ def _stage(
 ) -> JsonObject:
     from sim_node.tasks import start_names
 
-    starts = start_names(stage.starts)
+    starts = start_names(stage.starts, study.plan.simulated_task)
     cells = [cell for cell in study.cells if cell.stage is stage]
     outcomes = {_key(cell): _outcomes(cell, starts, rollouts) for cell in cells}
     rows = [_row(study, cell, starts, rollouts, outcomes[_key(cell)]) for cell in cells]

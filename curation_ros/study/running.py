@@ -215,6 +215,8 @@ def _trials(plan: StudyPlan, folder: Path, jobs: int, backend: str) -> PolicyTri
         max_steps=plan.max_steps,
         gives_up=plan.gives_up,
         budget_steps=plan.budget_steps,
+        simulated_task=plan.simulated_task,
+        topic_map=plan.topic_map,
     )
 
 
@@ -276,7 +278,7 @@ def _roll(
         RolloutUnit(policy, start)
         for cell in cells
         for policy in cell.policies.values()
-        for start in start_names(cell.stage.starts)
+        for start in start_names(cell.stage.starts, trials.simulated_task)
     ]
     wanted, n = len(set(units)), 0
 

@@ -20,7 +20,7 @@ from curation_ros.files import append_line, named_errors, read_lines, try_lock
 from curation_ros.study.plan import StudyPlan
 from curation_ros.study.unit_work import roll_units, train_units
 from curation_ros.study.units import PolicyUnit, Progress, RolloutUnit, Unit, start_name
-from sim_node.settings import MAX_STEPS
+from sim_node.settings import MAX_STEPS, SIMULATED_TASK
 
 #: Runs that try a unit before it stays failed.
 ATTEMPTS = 2
@@ -59,6 +59,8 @@ class PolicyTrials:
             `policy_node.rollouts.GiveUp`.
         budget_steps: simulation steps that all rollouts together may take, earlier runs included.
             Steps are commands executed; the ten settling steps of a reset do not count.
+        simulated_task: the task of all rollouts, a key of `sim_node.tasks.TASKS`.
+        topic_map: YAML file of the topic map of all rollouts; empty: the default one.
     """
 
     def __init__(
@@ -70,6 +72,8 @@ class PolicyTrials:
         max_steps: int = MAX_STEPS,
         gives_up: bool = False,
         budget_steps: int = StudyPlan.budget_steps,
+        simulated_task: str = SIMULATED_TASK,
+        topic_map: str = "",
     ) -> None:
         """Open or begin a study; its limits are declared in the log before anything runs.
 
@@ -80,6 +84,8 @@ class PolicyTrials:
             max_steps: most commands per rollout; the same for the whole study.
             gives_up: whether lost rollouts are ended early; the same for the whole study.
             budget_steps: another number than before is declared anew, and stays on record.
+            simulated_task: the task of all rollouts; the same for the whole study.
+            topic_map: YAML file of the topic map of all rollouts; empty: the default one.
 
         Raises:
             ConfigError: if a number is out of range, or the study has other limits.
@@ -92,16 +98,24 @@ class PolicyTrials:
                 "least 1 and 0"
             )
         self.folder, self.max_steps, self.budget_steps = Path(folder), max_steps, budget_steps
-        self.gives_up = gives_up
+        self.gives_up, self.simulated_task, self.topic_map = gives_up, simulated_task, topic_map
         self._jobs, self._backend = jobs, backend
         self._log = self.folder / "units.jsonl"
         declared = [row for row in read_lines(self._log) if row.get("kind") == "declaration"]
-        limits = {"max_steps": max_steps, "gives_up": gives_up, "budget_steps": budget_steps}
-        for key in ("max_steps", "gives_up") if declared else ():
-            if declared[-1].get(key, False) != limits[key]:
+        limits = {
+            "max_steps": max_steps,
+            "gives_up": gives_up,
+            "budget_steps": budget_steps,
+            "simulated_task": simulated_task,
+        }
+        # Old logs declare neither.
+        before = {"gives_up": False, "simulated_task": SIMULATED_TASK}
+        before |= declared[-1] if declared else limits
+        for key in ("max_steps", "gives_up", "simulated_task"):
+            if before[key] != limits[key]:
                 raise ConfigError(
-                    f"{self._log}: rollouts of this study have {key} "
-                    f"{declared[-1].get(key, False)}, not {limits[key]}"
+                    f"{self._log}: rollouts of this study have {key} {before[key]}, "
+                    f"not {limits[key]}"
                 )
         if not declared or declared[-1]["budget_steps"] != budget_steps:
             self._append({"kind": "declaration", **limits})
@@ -162,7 +176,7 @@ class PolicyTrials:
         """
         units = list({unit.key: unit for unit in units}.values())
         for start in {unit.start for unit in units}:
-            start_name(start)
+            start_name(start, self.simulated_task)
         with self._alone():
             past = _Past(self.rows("rollout"), lambda row: (row["policy"], row["start"]))
             trained = {row["policy"] for row in self.rows("policy") if row["status"] == "ok"}
@@ -179,7 +193,12 @@ class PolicyTrials:
                 now, todo = todo[:n], todo[n:]
                 groups = groupby(now, key=lambda unit: unit.policy)
                 tasks = [part for _, group in groups for part in _parts(list(group), _ROLLOUTS)]
-                settings = {"max_steps": self.max_steps, "gives_up": self.gives_up}
+                settings = {
+                    "max_steps": self.max_steps,
+                    "gives_up": self.gives_up,
+                    "simulated_task": self.simulated_task,
+                    "topic_map": self.topic_map,
+                }
                 fresh = self._run(roll_units, tasks, settings, progress)
                 rows += fresh
                 used += sum(int(row["steps"]) for row in fresh)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.errors import ConfigError, CurationError, PolicyError
 from curation_ros.core.types import JsonObject
@@ -15,7 +16,6 @@ from policy_node.mlp import MlpPolicy
 from policy_node.policy import load_policy
 from policy_node.rollouts import Rollout, rollout
 from policy_node.settings import TrainingSettings
-from sim_node.settings import SIMULATED_TASK
 from sim_node.tasks import process_environment, task_named
 
 
@@ -24,24 +24,34 @@ def policy_folder(study: Path, policy_id: str) -> Path:
     return study / "policies" / policy_id
 
 
-def roll_policy(policy: Path, start: str, max_steps: int) -> Rollout:
+def roll_policy(
+    policy: Path, start: str, max_steps: int, simulated_task: str, topic_map: str
+) -> Rollout:
     """One rollout, in the environment of this process.
 
     Args:
         policy: folder of the policy.
         start: its name.
         max_steps: most commands.
+        simulated_task: key of `sim_node.tasks.TASKS`.
+        topic_map: YAML file of the topic map; empty: the default one.
 
     Raises:
         ConfigError, PolicyError, SimError: as `policy_node.rollouts.rollout` does.
     """
-    task = task_named(SIMULATED_TASK)
+    task = task_named(simulated_task)
     env = process_environment(task.name)
-    return rollout(env, task, task.start(start), load_policy(policy), max_steps)
+    robot = topic_map_or_default(topic_map)
+    return rollout(env, task, task.start(start), load_policy(policy), robot, max_steps)
 
 
 def roll_units(
-    study: Path, units: Sequence[RolloutUnit], max_steps: int, gives_up: bool
+    study: Path,
+    units: Sequence[RolloutUnit],
+    max_steps: int,
+    gives_up: bool,
+    simulated_task: str,
+    topic_map: str,
 ) -> list[JsonObject]:
     """Roll out policies of a study.
 
@@ -50,20 +60,23 @@ def roll_units(
         units: what to do.
         max_steps: most commands per rollout.
         gives_up: whether lost rollouts are ended early.
+        simulated_task: key of `sim_node.tasks.TASKS`.
+        topic_map: YAML file of the topic map; empty: the default one.
 
     Returns:
         A row per unit; the status of one that failed is `failed`, with the reason.
     """
     rows = []
+    robot = topic_map_or_default(topic_map)
     for unit in units:
         steps = 0
         try:
             policy = load_policy(policy_folder(study, unit.policy))
-            task = task_named(SIMULATED_TASK)
-            start = task.start(start_name(unit.start))
+            task = task_named(simulated_task)
+            start = task.start(start_name(unit.start, task.name))
             env = process_environment(task.name)
             try:
-                made = rollout(env, task, start, policy, max_steps, gives_up=gives_up)
+                made = rollout(env, task, start, policy, robot, max_steps, gives_up=gives_up)
             except CurationError:
                 steps = env.n_steps
                 raise

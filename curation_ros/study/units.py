@@ -15,6 +15,7 @@ from curation_ros.core.errors import ConfigError
 from curation_ros.core.types import JsonObject, Span
 from policy_node.settings import DEFAULTS
 from policy_node.variants import Variant, read_training_config
+from sim_node.settings import SIMULATED_TASK
 from sim_node.tasks import start_names
 
 #: Called with each row when it is logged.
@@ -105,17 +106,20 @@ def named_variant(name: str) -> Variant:
     return read_training_config(share_file("config/training.yaml")).variant(name)
 
 
-def start_name(start: str) -> str:
-    """Name of a start as `Start` has it, also for official:3 and generated:7:12.
+def start_name(start: str, simulated_task: str = SIMULATED_TASK) -> str:
+    """Name of a start of a task as `Start` has it, also for official:3 and generated:7:12.
 
     Raises:
-        ConfigError: if it is no single start.
+        ConfigError: if it is no single start of the task, or there is no such task.
     """
-    if found := re.fullmatch(r"(official|generated:[0-9]{1,9}):([0-9]{1,9})", start):
-        [name] = start_names(f"{found[1]}:{found[2]}:{int(found[2]) + 1}")
-        return name
-    if re.fullmatch(r"official-[0-4][0-9]|generated-[0-9]{1,9}-[0-9]{3,9}", start):
-        return start
-    raise ConfigError(
-        f"start {start!r} is none; expected official:3, generated:7:12 or a name of a start"
+    found = re.fullmatch(
+        r"official[:-]([0-9]{1,9})|generated[:-]([0-9]{1,9})[:-]([0-9]{1,9})", start
     )
+    if not found:
+        raise ConfigError(
+            f"start {start!r} is none; expected official:3, generated:7:12 or a name of a start"
+        )
+    kind = "official" if found[1] else f"generated:{found[2]}"
+    index = int(found[1] or found[3])
+    [name] = start_names(f"{kind}:{index}:{index + 1}", simulated_task)
+    return name

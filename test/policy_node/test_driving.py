@@ -22,6 +22,7 @@ from graph import PATIENCE_S
 from pausing import PAUSE, RESUME, pausable
 
 from curation_ros.cli.main import main as curation
+from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.dataset.dataset import Dataset
@@ -34,15 +35,19 @@ pytest.importorskip("torch", reason="torch is not installed")
 
 from curation_ros.study.collect import Collection, collect  # noqa: E402 - needs LIBERO
 from policy_node.policy import load_policy  # noqa: E402 - needs safetensors
-from policy_node.rollouts import SimController, field_values  # noqa: E402 - needs LIBERO
+from policy_node.rollouts import SimController  # noqa: E402 - needs LIBERO
 from policy_node.settings import TrainingSettings  # noqa: E402 - as its neighbours
 from policy_node.train import train  # noqa: E402 - needs torch
 from sim_node.episodes import run_episode  # noqa: E402 - needs LIBERO
+from sim_node.fields import ObservedFields  # noqa: E402 - needs LIBERO
 from sim_node.settings import EpisodeLimits  # noqa: E402 - needs LIBERO
 from sim_node.tasks import start_names  # noqa: E402 - needs LIBERO
 from sim_node.tasks.bowl_on_plate import TASK  # noqa: E402 - needs LIBERO
 
 START = "generated:5:1"
+TOPIC_MAP = topic_map_or_default("")
+#: Every field that is no command.
+OBSERVED = [n for n, s in TOPIC_MAP.fields.items() if s.role not in ("action", "gripper")]
 MAX_STEPS = 400
 PERIOD_NS = 50_000_000
 
@@ -103,7 +108,7 @@ def driven(graph, folder):
 
 @pytest.fixture(scope="module")
 def in_process(folder):
-    """Steps and commands of the same policy from the same start, and how it went."""
+    """Steps and commands of the same policy from the same start, fields, and how it went."""
     steps = []
     [start] = start_names(START)
     with TASK.environment() as env:
@@ -111,11 +116,12 @@ def in_process(folder):
             env,
             TASK,
             TASK.start(start),
-            SimController(load_policy(folder)),
+            SimController(load_policy(folder), env, TOPIC_MAP),
             EpisodeLimits(MAX_STEPS, steps_after_success=0),
             on_step=lambda step, command: steps.append((step, command)),
         )
-    return steps, result
+        observed = ObservedFields(env, TOPIC_MAP, OBSERVED)
+        return steps, [observed.values(step) for step, _ in steps], result
 
 
 def test_bag_has_every_command_of_a_policy_that_the_recorder_met_late(driven):
@@ -129,14 +135,13 @@ def test_bag_has_every_command_of_a_policy_that_the_recorder_met_late(driven):
 
 def test_graph_and_one_process_go_the_same_way(driven, in_process):
     """Equal observations and commands over the whole episode, to the last bit."""
-    steps, result = in_process
+    steps, seen, result = in_process
     episode = driven.episode
     assert len(episode) == len(steps)
     np.testing.assert_array_equal(episode.field("twist"), [c.action_xyz for _, c in steps])
     np.testing.assert_array_equal(episode.field("gripper")[:, 0], [c.gripper for _, c in steps])
     np.testing.assert_array_equal(episode.field("phase")[:, 0], [s.phase_index for s, _ in steps])
-    seen = [field_values(s.observation) for s, _ in steps]
-    for name in seen[0]:
+    for name in OBSERVED:
         np.testing.assert_array_equal(episode.field(name), [values[name] for values in seen])
     # It grasped and let go: what is compared is more than a reach into the air.
     assert result.is_success
@@ -145,7 +150,7 @@ def test_graph_and_one_process_go_the_same_way(driven, in_process):
 
 
 def test_graph_and_one_process_end_the_same_way(driven, in_process):
-    _, result = in_process
+    _, _, result = in_process
     truth = driven.truth
     assert truth["outcome"] == ("succeeded" if result.is_success else "failed")
     assert (truth["steps"], truth["stage"]) == (result.n_steps, result.stage)

@@ -12,8 +12,10 @@ pytestmark = pytest.mark.sim
 pytest.importorskip("mujoco")
 pytest.importorskip("libero")
 
+from sim_node.fields import ObservedFields  # noqa: E402 - needs LIBERO
 from sim_node.settings import EpisodeLimits  # noqa: E402 - needs LIBERO
 from sim_node.tasks.bowl_on_plate import TASK  # noqa: E402 - needs LIBERO
+from sim_node.tasks.task import Step  # noqa: E402 - needs LIBERO
 
 MAX_STEPS = 12
 
@@ -30,9 +32,9 @@ def start():
 
 
 def test_observations_become_fields_of_the_topic_map(env, start):
-    from policy_node.rollouts import field_values
-
-    values = field_values(env.reset(start.state))
+    observed = ObservedFields(env, TOPIC_MAP, [*mlp("fingers").observed, "joint_position"])
+    first = env.reset(start.state)
+    values = observed.values(Step(0, first, 3, "LIFT", 0.5))
     for name, value in values.items():
         assert value.shape == (len(TOPIC_MAP.fields[name].values),)
     assert set(mlp("fingers").observed) <= {*values, "phase"}
@@ -43,9 +45,9 @@ def test_rollout_is_bounded_and_repeats_exactly(env, start):
     from policy_node.rollouts import rollout
 
     made = mlp()
-    first = rollout(env, TASK, start, made, MAX_STEPS)
+    first = rollout(env, TASK, start, made, TOPIC_MAP, MAX_STEPS)
     state = env.data.qpos.copy()
-    assert rollout(env, TASK, start, made, MAX_STEPS) == first
+    assert rollout(env, TASK, start, made, TOPIC_MAP, MAX_STEPS) == first
     np.testing.assert_array_equal(env.data.qpos, state)
     assert json.loads(json.dumps(first.to_json())) == {
         "policy": made.card.id,
@@ -61,7 +63,7 @@ def test_success_ends_the_rollout(env, start, monkeypatch):
     from policy_node.rollouts import rollout
 
     monkeypatch.setattr(env, "is_success", lambda: True)
-    done = rollout(env, TASK, start, mlp(), MAX_STEPS)
+    done = rollout(env, TASK, start, mlp(), TOPIC_MAP, MAX_STEPS)
     assert (done.success, done.steps) == (True, 1)
 
 
@@ -90,7 +92,7 @@ def test_a_policy_that_goes_nowhere_is_given_up(env, start):
         def act(self):
             return {"twist": np.zeros(3), "gripper": np.array([-1.0])}
 
-    ended = rollout(env, TASK, start, Idle(), gives_up=True)
+    ended = rollout(env, TASK, start, Idle(), TOPIC_MAP, gives_up=True)
     assert (ended.success, ended.ended, ended.steps) == (False, "phase", GiveUp.PHASE_STEPS)
     assert ended.stage == TASK.phases[0]
 
@@ -98,11 +100,11 @@ def test_a_policy_that_goes_nowhere_is_given_up(env, start):
 @pytest.mark.parametrize("ensembles", [False, True])
 def test_chunked_policy_is_rolled_out_like_any_other(env, start, ensembles):
     """Its commands are those that it gives when it is shown the same observations alone."""
-    from policy_node.rollouts import SimController, field_values
+    from policy_node.rollouts import SimController
     from sim_node.episodes import run_episode
 
     steps = []
-    controller = SimController(ChunkedPolicy(horizon=5, ensembles=ensembles))
+    controller = SimController(ChunkedPolicy(5, ensembles), env, TOPIC_MAP)
     run_episode(
         env,
         TASK,
@@ -112,8 +114,9 @@ def test_chunked_policy_is_rolled_out_like_any_other(env, start, ensembles):
         on_step=lambda *s: steps.append(s),
     )
     alone = ChunkedPolicy(horizon=5, ensembles=ensembles)
+    observed = ObservedFields(env, TOPIC_MAP, alone.observed)
     for step, executed in steps:
-        alone.observe(field_values(step.observation))
+        alone.observe(observed.values(step))
         command = alone.act()
         np.testing.assert_array_equal(executed.action_xyz, command["twist"])
         assert executed.gripper == command["gripper"][0]
@@ -122,7 +125,6 @@ def test_chunked_policy_is_rolled_out_like_any_other(env, start, ensembles):
 
 def test_policy_without_gripper_leaves_it_as_it_is(env, start):
     from policy_node.rollouts import SimController
-    from sim_node.tasks.task import Step
 
     class Handless(ChunkedPolicy):
         commanded = ("twist",)
@@ -131,5 +133,5 @@ def test_policy_without_gripper_leaves_it_as_it_is(env, start):
             return {"twist": super().act()["twist"]}
 
     step = Step(0, env.reset(start.state), 0, TASK.phases[0], 0.0)
-    _, gripper = SimController(Handless()).act(step)
+    _, gripper = SimController(Handless(), env, TOPIC_MAP).act(step)
     assert gripper == 0.0

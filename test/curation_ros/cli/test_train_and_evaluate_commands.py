@@ -104,6 +104,10 @@ def test_starts_that_make_no_sense_are_told(curation: Run, folder: Path) -> None
         told = curation("evaluate", "--policy", row["policy"], "--starts", starts, "--json")
         assert (told.code, told.out) == (USAGE, ""), starts
         assert f"starts {starts!r}" in told.err
+    other = ["--simulated-task", "dance", "--json"]
+    told = curation("evaluate", "--policy", row["policy"], *other)
+    assert (told.code, told.out) == (USAGE, "")
+    assert told.err.startswith("error: simulated task 'dance' is unknown; known: bowl_on_plate, ")
     for more in ([], ["--graph"]):
         steps = ["--starts", "official:0:1", "--max-steps", "0", *more]
         told = curation("evaluate", "--policy", row["policy"], *steps, "--json")

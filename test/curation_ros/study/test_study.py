@@ -216,6 +216,7 @@ def test_what_the_budget_does_not_bear_is_missing_and_said(
         ({"reference": {"episodes": 2, "starts": "generated:3:2"}}, "'look': start generated-3-0"),
         ({"more": {"episodes": 2, "starts": "generated:1:2"}}, "used by reference and by more"),
         ({"reference": {"episodes": 2, "seeds": 3}}, "dataset 'reference': .*seeds"),
+        ({"simulated_task": "dance"}, "simulated task 'dance' is unknown; known: bowl_on_plate"),
     ],
 )
 def test_starts_that_are_shared_are_refused(change: dict[str, Any], said: str) -> None:

@@ -166,6 +166,16 @@ def test_limits_of_a_study_stay(study: PolicyTrials) -> None:
         PolicyTrials(study.folder, max_steps=7)
     with pytest.raises(ConfigError, match="budget_steps -1"):
         trials(study.folder, budget_steps=-1)
+    with pytest.raises(ConfigError, match="simulated_task bowl_on_plate, not bowl_from_center"):
+        trials(study.folder, simulated_task="bowl_from_center")
+
+
+def test_log_from_before_tasks_had_names_is_of_the_first_task(tmp_path: Path) -> None:
+    old = {"kind": "declaration", "max_steps": MAX_STEPS, "budget_steps": 4_000_000}
+    (tmp_path / "units.jsonl").write_text(json.dumps(old) + "\n")
+    assert trials(tmp_path).rows("declaration") == [old]
+    with pytest.raises(ConfigError, match="simulated_task bowl_on_plate, not bowl_from_center"):
+        trials(tmp_path, simulated_task="bowl_from_center")
 
 
 # --- failures -----------------------------------------------------------------------------------
