@@ -25,6 +25,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from one_core import environment
+from rows import row
 
 if TYPE_CHECKING:
     # At run time a worker imports these from its own tree, which may be the old one.
@@ -128,11 +130,10 @@ def take_out(commit: str, folder: Path) -> None:
 
 def measured(tree: Path, *, is_old: bool, n_references: int) -> dict[str, Any]:
     """What `measure` returns in a process of a tree, with one thread on one core."""
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     arguments = ["--tree", str(tree), "--references", str(n_references)]
     done = subprocess.run(
         [sys.executable, __file__, *arguments, *(["--old"] if is_old else [])],
-        env={**os.environ, **threads, "PYTHONPATH": str(tree)},
+        env={**environment(), "PYTHONPATH": str(tree)},
         cwd=tree,
         check=True,
         stdout=subprocess.PIPE,
@@ -160,20 +161,18 @@ def compared(old_tree: Path, n_references: int) -> list[dict[str, Any]]:
     what = f"examine {_SAMPLE}, {n_references or 'no'} references, CPU"
     before = f"{what}, at {OLD}"
     return [
-        _row(before, statistics.median(pair[True]["ms"] for pair in pairs)),
-        {
-            **_row(what, statistics.median(pair[False]["ms"] for pair in pairs)),
-            "against": before,
-            "ratio": ratio,
-            "target": f"ratio >= {TARGET:g}",
-            "holds": ratio >= TARGET,
-        },
+        row(before, statistics.median(pair[True]["ms"] for pair in pairs), "ms", COMMAND),
+        row(
+            what,
+            statistics.median(pair[False]["ms"] for pair in pairs),
+            "ms",
+            COMMAND,
+            against=before,
+            ratio=ratio,
+            target=f"ratio >= {TARGET:g}",
+            holds=ratio >= TARGET,
+        ),
     ]
-
-
-def _row(name: str, value: float) -> dict[str, Any]:
-    empty = {"against": "", "ratio": None, "target": None, "holds": None}
-    return {"name": name, "value": value, "unit": "ms", **empty, "command": COMMAND}
 
 
 def run() -> list[dict[str, Any]]:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from curation_ros.bags import BagWriter
 from curation_ros.bags.messages import to_cdr
 from curation_ros.core.episode import messages
 from curation_ros.core.episode.identity import new_episode_id
 from curation_ros.core.episode.messages import JOINT_STATE, POSE, STATUS_ARRAY, TWIST, PlainMessage
-from curation_ros.core.episode.status import EpisodeEvent, event_to_json, phase_to_status
+from curation_ros.core.episode.status import EpisodeEvent, Status, event_to_json, phase_to_status
 from curation_ros.core.episode.topic_map import TopicMap
 
 N_MESSAGES = 5000
@@ -61,18 +64,31 @@ def write_topic(folder: Path, type_name: str) -> Path:
     return writer.path
 
 
-def write_episode(folder: Path, topic_map: TopicMap, number: int, pace: str) -> EpisodeEvent:
-    """Write a pick-and-place demonstration of the LIBERO robot.
+@dataclass(frozen=True)
+class Motion:
+    """A pick and place, with one row per step.
 
-    Args:
-        folder: of the bag.
-        topic_map: stored in the bag.
-        number: of the episode; motion, durations and goal vary with it.
-        pace: one of STEPS_PER_CHUNK.
-
-    Returns:
-        The event at the end of the episode.
+    Attributes:
+        phase: (T,) index of the phase.
+        progress: (T,) progress within the phase.
+        twist: (T, 3) command, unitless.
+        eef_m: (T, 3) position of the effector.
+        bowl_m: (T, 3) position of the bowl.
+        joints: (T, 3, 9) position, velocity and effort of ARM.
+        is_closed: (T,) whether the gripper is commanded to be closed.
     """
+
+    phase: npt.NDArray[np.int64]
+    progress: npt.NDArray[np.float64]
+    twist: npt.NDArray[np.float64]
+    eef_m: npt.NDArray[np.float64]
+    bowl_m: npt.NDArray[np.float64]
+    joints: npt.NDArray[np.float64]
+    is_closed: npt.NDArray[np.bool_]
+
+
+def make_motion(number: int) -> Motion:
+    """The motion of a demonstration; way, durations and goal vary with its number."""
     rng = np.random.default_rng(number)
     edges = np.cumsum([0, 60, 45, 20, 60, 130]) + np.concatenate([[0], rng.integers(-6, 7, 5)])
     phase = np.searchsorted(edges, np.arange(N_STEPS), side="right") - 1
@@ -92,6 +108,44 @@ def write_episode(folder: Path, topic_map: TopicMap, number: int, pace: str) -> 
     joints = np.cumsum(0.01 * rng.standard_normal((N_STEPS, 3, len(ARM))), axis=0)
     joints[:, 0, 7:] = np.column_stack([width / 2, -width / 2])
     bowl = np.where(is_closed[:, None], eef, eef[int(np.argmax(is_closed))])
+    progress = (np.arange(N_STEPS) - edges[phase]) / N_STEPS
+    return Motion(phase, progress, twist, eef, bowl, joints, is_closed)
+
+
+def messages_at(motion: Motion, k: int, t: int, phase: Status) -> Iterator[PlainMessage]:
+    """All messages of step `k`, at stamp `t`."""
+
+    def pose(topic: str, position_m: Iterable[float]) -> PlainMessage:
+        return PlainMessage(topic, POSE, messages.pose(position_m, _QUAT_XYZW, t))
+
+    def joints(topic: str, names: list[str], values: Iterable[Iterable[float]]) -> PlainMessage:
+        position, velocity, effort = values
+        content = messages.joint_state(names, position, velocity, effort, t)
+        return PlainMessage(topic, JOINT_STATE, content)
+
+    yield pose("eef_pose", motion.eef_m[k])
+    yield joints("joint_states", ARM, motion.joints[k])
+    yield pose("objects/akita_black_bowl_1/pose", motion.bowl_m[k])
+    yield pose("objects/plate_1/pose", _PLATE_M)
+    yield PlainMessage("phase", STATUS_ARRAY, messages.status_array([phase], t))
+    yield PlainMessage("command/twist", TWIST, messages.twist(motion.twist[k], t))
+    gripper = 1.0 if motion.is_closed[k] else -1.0
+    yield joints("command/gripper", ["gripper"], ([gripper], [0.0], [0.0]))
+
+
+def write_episode(folder: Path, topic_map: TopicMap, number: int, pace: str) -> EpisodeEvent:
+    """Write a pick-and-place demonstration of the LIBERO robot.
+
+    Args:
+        folder: of the bag.
+        topic_map: stored in the bag.
+        number: of the episode, see `make_motion`.
+        pace: one of STEPS_PER_CHUNK.
+
+    Returns:
+        The event at the end of the episode.
+    """
+    motion = make_motion(number)
     stamps = START_NS + STEP_NS * (np.arange(N_STEPS) + 1)
     event = EpisodeEvent(
         new_episode_id(),
@@ -112,27 +166,10 @@ def write_episode(folder: Path, topic_map: TopicMap, number: int, pace: str) -> 
     )
     [labels] = [spec.labels for spec in topic_map.with_role("phase")]
     for k, t in enumerate(stamps.tolist()):
-        position, velocity, effort = joints[k]
-        gripper = [1.0] if is_closed[k] else [-1.0]
-        label, progress = labels[phase[k]], (k - edges[phase[k]]) / N_STEPS
-        status = phase_to_status(event.id, label, int(phase[k]), float(progress))
-        contents = {
-            "eef_pose": (POSE, messages.pose(eef[k], _QUAT_XYZW, t)),
-            "joint_states": (
-                JOINT_STATE,
-                messages.joint_state(ARM, position, velocity, effort, t),
-            ),
-            "objects/akita_black_bowl_1/pose": (POSE, messages.pose(bowl[k], _QUAT_XYZW, t)),
-            "objects/plate_1/pose": (POSE, messages.pose(_PLATE_M, _QUAT_XYZW, t)),
-            "phase": (STATUS_ARRAY, messages.status_array([status], t)),
-            "command/twist": (TWIST, messages.twist(twist[k], t)),
-            "command/gripper": (
-                JOINT_STATE,
-                messages.joint_state(["gripper"], gripper, [0.0], [0.0], t),
-            ),
-        }
-        for topic, (type_name, content) in contents.items():
-            _write(writer, PlainMessage(topic, type_name, content), t, k + 1)
+        phase = int(motion.phase[k])
+        status = phase_to_status(event.id, labels[phase], phase, float(motion.progress[k]))
+        for message in messages_at(motion, k, t, status):
+            _write(writer, message, t, k + 1)
         if (k + 1) % STEPS_PER_CHUNK[pace] == 0:
             writer.flush()
     writer.close()

@@ -13,6 +13,8 @@ import sys
 import time
 from typing import Any
 
+from rows import row
+
 from sim_node.settings import SIMULATED_TASK
 from sim_node.tasks import TASKS
 
@@ -59,16 +61,14 @@ def run() -> list[dict[str, Any]]:
         ratio = statistics.median(a / b for a, b in pairs)
         for lean in (True, False):
             rows.append(
-                {
-                    "name": f"{name}, {'lean' if lean else 'stock'}",
-                    "value": statistics.median(seconds[lean]),
-                    "unit": "s",
-                    "against": f"{name}, stock" if lean else "",
-                    "ratio": ratio if lean else None,
-                    "target": None,
-                    "holds": None,
-                    "command": COMMAND,
-                }
+                row(
+                    f"{name}, {'lean' if lean else 'stock'}",
+                    statistics.median(seconds[lean]),
+                    "s",
+                    COMMAND,
+                    against=f"{name}, stock" if lean else "",
+                    ratio=ratio if lean else None,
+                )
             )
     return rows
 

@@ -13,12 +13,14 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from one_core import rows_of
+from rows import row
 from torch.utils.data import DataLoader, TensorDataset
 
 from curation_ros.core.episode.episode import Episode
@@ -94,16 +96,16 @@ def train_by_data_loader(kept: Demonstrations, seed: int) -> None:
                 break
 
 
-def measure(n_rounds: int = N_ROUNDS) -> list[dict[str, Any]]:
-    """All rows, measured in this process."""
-    torch.set_num_threads(1)
-    rng = np.random.default_rng(0)
-    every = demonstrations(rng)
-    # Selections of the paper's size; each policy has its own.
-    kept = [
-        [every[i] for i in rng.choice(N_EPISODES, N_KEPT, replace=False)]
-        for _ in range(N_POLICIES)
-    ]
+#: Number of policies that a way of training makes per round, and how it does so.
+Way = tuple[int, Callable[[], list[TrainedPolicy] | None]]
+
+
+def ways_to_train(kept: list[Demonstrations]) -> dict[str, Way]:
+    """The ways that are compared.
+
+    Args:
+        kept: a selection of demonstrations for each policy.
+    """
     jobs = [TrainingJob(f"policy {k}", own, VARIANT, seed=k) for k, own in enumerate(kept)]
 
     def one_after_the_other() -> list[TrainedPolicy]:
@@ -118,13 +120,26 @@ def measure(n_rounds: int = N_ROUNDS) -> list[dict[str, Any]]:
     def by_data_loader() -> None:
         train_by_data_loader(kept[0], 0)
 
-    ways: dict[str, tuple[int, Callable[[], list[TrainedPolicy] | None]]] = {
+    return {
         "alone": (N_ALONE, one_after_the_other),
         "together": (N_POLICIES, lambda: together(GROUP)),
         "all together": (N_POLICIES, lambda: together(N_POLICIES)),
         "data loader": (1, by_data_loader),
     }
-    # torch loads what its optimizers need.
+
+
+def measure(n_rounds: int = N_ROUNDS) -> list[dict[str, Any]]:
+    """All rows, measured in this process."""
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(0)
+    every = demonstrations(rng)
+    # Selections of the paper's size; each policy has its own.
+    kept = [
+        [every[i] for i in rng.choice(N_EPISODES, N_KEPT, replace=False)]
+        for _ in range(N_POLICIES)
+    ]
+    ways = ways_to_train(kept)
+    # The first training loads what torch's optimizers need.
     train(kept[0], VARIANT, seed=0, settings=TrainingSettings(steps=1))
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     difference = 0.0
@@ -141,20 +156,27 @@ def measure(n_rounds: int = N_ROUNDS) -> list[dict[str, Any]]:
         for a, b in zip(results["alone"] or [], results["together"] or [], strict=False):
             gaps = np.abs(np.subtract(a.losses[:N_EQUAL], b.losses[:N_EQUAL]))
             difference = max(difference, float(gaps.max()))
+    return rows_from(seconds, difference)
+
+
+def rows_from(seconds: dict[str, list[float]], difference: float) -> list[dict[str, Any]]:
+    """The rows of the benchmark.
+
+    Args:
+        seconds: way of training -> seconds per policy in each round.
+        difference: largest difference of the losses of the first two ways.
+    """
 
     def ratio(slow: str, fast: str = "together") -> float:
         pairs = zip(seconds[slow], seconds[fast], strict=True)
         return statistics.median(a / b for a, b in pairs)
 
-    def row(name: str, value: float, unit: str, **extra: float | str | bool) -> dict[str, Any]:
-        empty = {"against": "", "ratio": None, "target": None, "holds": None}
-        return {"name": name, "value": value, "unit": unit, **empty, **extra, "command": COMMAND}
-
+    as_row = partial(row, command=COMMAND)
     median = {name: statistics.median(values) for name, values in seconds.items()}
     unit = "s/policy"
     return [
-        row("training, one policy after the other", median["alone"], unit),
-        row(
+        as_row("training, one policy after the other", median["alone"], unit),
+        as_row(
             f"training, {N_POLICIES} policies by train_many",
             median["together"],
             unit,
@@ -163,21 +185,21 @@ def measure(n_rounds: int = N_ROUNDS) -> list[dict[str, Any]]:
             target=f"ratio >= {TARGET_RATIO}",
             holds=ratio("alone") >= TARGET_RATIO,
         ),
-        row(
+        as_row(
             f"training, {N_POLICIES} policies by train_many in one group",
             median["all together"],
             unit,
             against="training, one policy after the other",
             ratio=ratio("alone", "all together"),
         ),
-        row(
+        as_row(
             "training, DataLoader loop",
             median["data loader"],
             unit,
             against=f"training, {N_POLICIES} policies by train_many",
             ratio=ratio("data loader"),
         ),
-        row(
+        as_row(
             f"training, largest difference of the first {N_EQUAL} losses",
             difference,
             "",
