@@ -86,17 +86,16 @@ class _Track:
     def ordered(self, start_ns: int, end_ns: int) -> TopicSamples:
         """The samples inside a window in their order."""
         self._decode_pending()
-        none = np.empty(0, dtype=np.int64)
-        stamps = np.concatenate([*self._stamps, none])
-        seqs = np.concatenate([*self._seqs, none])
-        values = np.concatenate([*self._columns, np.empty((0, len(self.paths)))])
-        # Joined once: repeated calls of `partial` pay only for what is new.
-        self._stamps, self._seqs, self._columns = [stamps], [seqs], [values]
+        if len(self._stamps) != 1:  # joined once: repeated calls pay only for what is new
+            none = np.empty(0, dtype=np.int64)
+            self._stamps = [np.concatenate([*self._stamps, none])]
+            self._seqs = [np.concatenate([*self._seqs, none])]
+            self._columns = [np.concatenate([*self._columns, np.empty((0, len(self.paths)))])]
         return ordered_samples(
             {path: k for k, path in enumerate(self.paths)},
-            stamps,
-            seqs,
-            values,
+            self._stamps[0],
+            self._seqs[0],
+            self._columns[0],
             (start_ns, end_ns),
             undecodable=self.bad,
             unknown=self.unknown,
