@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +14,8 @@ from curation_ros.core.episode.topic_map import FieldSpec, TopicMap
 from curation_ros.core.errors import CurationError
 from curation_ros.core.types import Floats
 from policy_node.controller import PolicyController
+from policy_node.joining import EqualStamps, Joiner
 from policy_node.policy import Command, Policy
-
-#: Observations that wait for their last fields. Without an episode, old ones are of no use.
-_MOST_WAITING = 100
 
 
 @dataclass(frozen=True)
@@ -33,20 +32,27 @@ class Answer:
 
 
 class LivePolicy:
-    """Collects the fields that a policy observes; when all have one stamp, the policy answers.
+    """Joins samples to the observations of a policy, and gives the policy's answers.
 
     Attributes:
         topic_map: the observed fields alone: what to subscribe to.
-        problem: why the running episode is not driven; empty where it is.
+        problem: why the last observation of the running episode has no answer; empty if it has.
     """
 
-    def __init__(self, policy: Policy, topic_map: TopicMap, decoder: CdrDecoder) -> None:
+    def __init__(
+        self,
+        policy: Policy,
+        topic_map: TopicMap,
+        decoder: CdrDecoder,
+        join: Callable[[TopicMap], Joiner] = EqualStamps,
+    ) -> None:
         """Wait for an episode.
 
         Args:
             policy: what answers.
             topic_map: of the robot.
             decoder: reads the samples.
+            join: makes what joins the samples, see `policy_node.joining`.
 
         Raises:
             PolicyError: if the policy was trained on topics that mean something else.
@@ -56,8 +62,8 @@ class LivePolicy:
         self.problem = ""
         self._controller = PolicyController(policy)
         self._decoder = decoder
+        self._joiner = join(self.topic_map)
         self._episode: EpisodeEvent | None = None
-        self._waiting: dict[int, dict[str, Floats]] = {}
         self._answered_ns: int | None = None
 
     @property
@@ -74,11 +80,10 @@ class LivePolicy:
         if event.event == "started":
             self._episode, self._answered_ns, self.problem = event, None, ""
             self._controller.reset()
-            for stamp_ns in [s for s in self._waiting if s < event.start_ns]:
-                del self._waiting[stamp_ns]
+            self._joiner.clear(event.start_ns)
         elif self._episode is not None and event.id == self._episode.id:
             self._episode = None
-            self._waiting.clear()
+            self._joiner.clear()
         return self._answers()
 
     def sample(self, sample: Sample) -> list[Answer]:
@@ -88,15 +93,16 @@ class LivePolicy:
             Answers that are due now, oldest first. An observation that is repeated is answered
             with the same command again.
         """
-        values = self._waiting.setdefault(sample.stamp_ns, {})
-        if len(self._waiting) > _MOST_WAITING:
-            del self._waiting[min(self._waiting)]
         try:
-            for spec in self.topic_map.fields.values():
-                if spec.topic == sample.topic:
-                    values[spec.name] = self._decoded(spec, sample)
+            values = {
+                spec.name: self._decoded(spec, sample)
+                for spec in self.topic_map.fields.values()
+                if spec.topic == sample.topic
+            }
         except CurationError as err:
             self.problem = str(err)
+        else:
+            self._joiner.add(sample.topic, sample.stamp_ns, values)
         return self._answers()
 
     def _decoded(self, spec: FieldSpec, sample: Sample) -> Floats:
@@ -111,20 +117,20 @@ class LivePolicy:
         if episode is None:
             return []
         answers = []
-        for stamp_ns in sorted(self._waiting):
-            values = self._waiting[stamp_ns]
-            if len(values) < len(self.topic_map.fields) or stamp_ns < episode.start_ns:
+        for stamp_ns, values, missing in self._joiner.take(episode.start_ns):
+            if missing:
+                self.problem = f"{episode.name}: {missing}"
                 continue
-            del self._waiting[stamp_ns]
             command = self._answer(stamp_ns, values, episode)
             if command is not None:
                 answers.append(Answer(stamp_ns, command))
         return answers
 
     def _answer(
-        self, stamp_ns: int, values: dict[str, Floats], episode: EpisodeEvent
+        self, stamp_ns: int, values: Mapping[str, Floats], episode: EpisodeEvent
     ) -> Command | None:
-        if self._answered_ns is None and stamp_ns != episode.start_ns:
+        is_first = self._answered_ns is None
+        if is_first and self._joiner.starts_at_start and stamp_ns != episode.start_ns:
             self.problem = (
                 f"{episode.name}: its first observation was not received: not driving it"
             )
@@ -136,5 +142,5 @@ class LivePolicy:
         except CurationError as err:
             self.problem = f"{episode.name}: {err}"
             return None
-        self._answered_ns = stamp_ns
+        self._answered_ns, self.problem = stamp_ns, ""
         return command

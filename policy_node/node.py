@@ -20,12 +20,19 @@ from curation_ros.nodes.qos import LATCHED, MAPPED
 from curation_ros.nodes.spinning import WorkingNode, run
 from curation_ros.nodes.subscriptions import MappedSubscriptions
 from policy_node.command_messages import CommandMessages
+from policy_node.joining import JOINERS
 from policy_node.live import Answer, LivePolicy
 from policy_node.policy import load_policy
 
 PARAMETERS = (
     Parameter("policy", "", "folder of the policy: weights and card"),
     Parameter("topic_map", "", "YAML file of the topic map; empty: the LIBERO robot of sim_node"),
+    Parameter(
+        "stamps",
+        "equal",
+        "an observation has samples of one stamp, or the latest of each topic",
+        choices=tuple(JOINERS),
+    ),
 )
 
 
@@ -39,7 +46,7 @@ class PolicyNode(WorkingNode):
             raise ConfigError("policy_node: parameter 'policy' is empty: name a policy's folder")
         policy = load_policy(Path(p["policy"]).expanduser())
         topic_map = topic_map_or_default(p["topic_map"])
-        self._live = LivePolicy(policy, topic_map, CdrDecoder())
+        self._live = LivePolicy(policy, topic_map, CdrDecoder(), JOINERS[p["stamps"]])
         self._messages = CommandMessages(topic_map, policy.commanded)
         # Not `_publishers`: rclpy has a list of this name.
         self._outputs = {

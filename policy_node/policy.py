@@ -159,7 +159,7 @@ def load_policy(folder: Path | str) -> Policy:
     """
     folder = Path(folder)
     kind = read_card(folder)["kind"]
-    if kind not in POLICIES:
+    if not isinstance(kind, str) or kind not in POLICIES:
         raise PolicyError(
             f"{folder / CARD}: kind {kind!r} of policy is none of {', '.join(POLICIES)}"
         )

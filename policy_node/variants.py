@@ -18,7 +18,7 @@ from policy_node.observation import observation_spec
 from policy_node.settings import TrainingSettings
 
 DRAFT = "draft"
-#: Roles of the fields that a drafted observation takes, beside the fingers and the phase.
+#: Roles of the fields that a drafted observation takes, in addition to the fingers.
 _OBSERVED_ROLES = ("clock", "effector", "observation", "object", "phase")
 _OBSERVED_TEXT = f"{', '.join(_OBSERVED_ROLES[:-1])} or {_OBSERVED_ROLES[-1]}"
 #: Commands in these units are places to go to; the middle of the demonstrations is their center.
@@ -185,25 +185,41 @@ def settings_from(raw: object, where: str) -> TrainingSettings:
         raise ConfigError(f"{where}: {err}") from err
 
 
-def command_terms_from_text(text: str) -> tuple[CommandTerm, ...]:
-    """Command terms of a command line: `twist=0.2,gripper` gives a scale to the first one.
+def choose_variant(
+    config: TrainingConfig,
+    topic_map: TopicMap,
+    *,
+    name: str = "",
+    observation: str = "",
+    action: str = "",
+) -> Variant:
+    """The variant that a person asks for, else the first one that fits, else a draft.
+
+    Args:
+        config: with the variants.
+        topic_map: of the demonstrations.
+        name: of a variant, or `draft`; empty: not asked for.
+        observation: terms that replace those of the variant, such as `tool_pose,cup_pose@start`.
+        action: fields that replace those of the variant, such as `twist=0.2,gripper`.
+
+    Returns:
+        The variant; its name ends in `-changed` if terms or fields were replaced.
 
     Raises:
-        ConfigError: if a name is empty or a scale is no number above 0.
+        ConfigError: if there is no variant of this name, or the action cannot be read.
+        PolicyError: if a draft is needed and the topic map has no fields for one.
     """
-    terms = []
-    for part in text.split(","):
-        name, equals, number = (word.strip() for word in part.partition("="))
-        if not name:
-            raise ConfigError(f"action {text!r}: expected fields such as twist=0.2,gripper")
-        scale: object = number if equals else _FROM_DATA
-        if equals and number != _FROM_DATA:
-            try:
-                scale = float(number)
-            except ValueError:
-                raise ConfigError(f"action {text!r}: {number!r} is no number") from None
-        terms.append(_command_term(name, {"scale": scale}, "action"))
-    return tuple(terms)
+    if name in config.variants or name not in ("", DRAFT):
+        variant = config.variant(name)
+    else:
+        fitting = None if name else config.fitting(topic_map)
+        variant = fitting or draft_variant(topic_map)
+    changes: dict[str, Any] = {}
+    if observation:
+        changes["observation"] = tuple(term.strip() for term in observation.split(","))
+    if action:
+        changes["action"] = _command_terms(action)
+    return replace(variant, name=f"{variant.name}-changed", **changes) if changes else variant
 
 
 def _variant(name: str, raw: object, where: str) -> Variant:
@@ -217,6 +233,23 @@ def _variant(name: str, raw: object, where: str) -> Variant:
         raise ConfigError(f"{here}: 'action' is {action!r:.60}, expected a mapping of fields")
     commands = tuple(_command_term(str(key), value, here) for key, value in action.items())
     return Variant(name, tuple(terms), commands)
+
+
+def _command_terms(text: str) -> tuple[CommandTerm, ...]:
+    """Command terms of a text such as `twist=0.2,gripper`, which gives a scale to the first."""
+    terms = []
+    for part in text.split(","):
+        name, equals, number = (word.strip() for word in part.partition("="))
+        if not name:
+            raise ConfigError(f"action {text!r}: expected fields such as twist=0.2,gripper")
+        scale: object = number if equals else _FROM_DATA
+        if equals and number != _FROM_DATA:
+            try:
+                scale = float(number)
+            except ValueError:
+                raise ConfigError(f"action {text!r}: {number!r} is no number") from None
+        terms.append(_command_term(name, {"scale": scale}, "action"))
+    return tuple(terms)
 
 
 def _command_term(name: str, raw: object, where: str) -> CommandTerm:

@@ -15,7 +15,6 @@ from rich.progress import Progress
 from curation_ros.cli.output import print_json, progress_console, say, warn
 from curation_ros.configuration import share_file
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import ConfigError
 from curation_ros.core.types import Span
 from curation_ros.dataset.manifests import read_manifest, read_selected
@@ -24,8 +23,7 @@ from policy_node.variants import (
     DRAFT,
     TrainingConfig,
     Variant,
-    command_terms_from_text,
-    draft_variant,
+    choose_variant,
     read_training_config,
 )
 
@@ -53,10 +51,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--observation",
+        default="",
         help="observe these terms instead of the variant's, such as tool_pose,cup_pose@start",
     )
     parser.add_argument(
         "--action",
+        default="",
         help="command these fields instead of the variant's, such as twist=0.2,gripper; the "
         "number is the scale, without one it is taken from the demonstrations",
     )
@@ -90,7 +90,13 @@ def run(args: argparse.Namespace) -> int:
     config = read_training_config(args.config or share_file("config/training.yaml"))
     settings = _settings(args, config)
     episodes = read_selected(manifest, dataset)
-    variant = _variant(args, config, episodes[0][0].topic_map)
+    variant = choose_variant(
+        config,
+        episodes[0][0].topic_map,
+        name=args.variant or (DRAFT if args.draft else ""),
+        observation=args.observation,
+        action=args.action,
+    )
     if args.draft:
         if args.json:
             print_json(variant.to_json())
@@ -133,27 +139,6 @@ def _settings(args: argparse.Namespace, config: TrainingConfig) -> TrainingSetti
     """Settings of the config, with those of the command line."""
     given = {"steps": args.steps, "start_jitter_m": args.start_jitter_m}
     return replace(config.settings, **{k: v for k, v in given.items() if v is not None})
-
-
-def _variant(args: argparse.Namespace, config: TrainingConfig, topic_map: TopicMap) -> Variant:
-    """The variant that was asked for, else the first one that fits, else a draft."""
-    if args.variant and args.variant != DRAFT:
-        variant = config.variant(args.variant)
-    else:
-        fitting = None if args.variant or args.draft else config.fitting(topic_map)
-        variant = fitting or draft_variant(topic_map)
-    if args.observation:
-        terms = tuple(term.strip() for term in args.observation.split(","))
-        variant = replace(variant, name=_named(variant), observation=terms)
-    if args.action:
-        terms_of_action = command_terms_from_text(args.action)
-        variant = replace(variant, name=_named(variant), action=terms_of_action)
-    return variant
-
-
-def _named(variant: Variant) -> str:
-    """A name that says that the variant was changed on the command line."""
-    return variant.name if variant.name.endswith("-changed") else f"{variant.name}-changed"
 
 
 def _train(

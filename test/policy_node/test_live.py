@@ -16,6 +16,7 @@ from curation_ros.bags.cdr import CdrDecoder
 from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.core.errors import PolicyError
 from policy_node.controller import PolicyController
+from policy_node.joining import LatestSamples
 from policy_node.live import LivePolicy
 
 POLICIES = {
@@ -196,3 +197,71 @@ def test_policy_that_does_not_fit_the_robot_is_refused():
     fields = {k: v for k, v in TOPIC_MAP.fields.items() if k != "eef_position"}
     with pytest.raises(PolicyError, match="no field 'eef_position'"):
         LivePolicy(ChunkedPolicy(), replace(TOPIC_MAP, fields=fields), CdrDecoder())
+
+
+# --- topics whose stamps differ -----------------------------------------------------------------
+
+EARLIER_NS, LATER_NS = -7_000_000, 7_000_000
+
+
+def shifted(samples, by_ns):
+    """Samples of a step with other stamps, but for the clock's, which comes last."""
+    clock = TOPIC_MAP.clock_topic
+    others = [s._replace(stamp_ns=s.stamp_ns + by_ns) for s in samples if s.topic != clock]
+    return [*others, *(s for s in samples if s.topic == clock)]
+
+
+def latest(policy):
+    return LivePolicy(POLICIES[policy](), TOPIC_MAP, CdrDecoder(), LatestSamples)
+
+
+@policies
+def test_latest_samples_before_the_clock_are_the_observation(policy, episode):
+    driven, answers = latest(policy), []
+    driven.event(started(episode, start_ns=episode.start_ns - 1))  # as a person starts it
+    for k in range(len(episode)):
+        *others, clock = shifted(observations(episode, k), EARLIER_NS)
+        assert fed(driven, others) == []
+        answers += driven.sample(clock)
+    assert_answers(answers, episode, expected(policy, episode))
+    assert (len(answers), driven.problem) == (len(episode), "")
+
+
+def test_samples_after_the_clock_belong_to_the_next_observation(episode):
+    driven = latest("mlp")
+    fed(driven, shifted(observations(episode, 0), LATER_NS))
+    driven.event(started(episode, start_ns=episode.start_ns + 1))
+    *others, clock = shifted(observations(episode, 1), LATER_NS)
+    fed(driven, others)  # they overtake the clock
+    [answer] = driven.sample(clock)
+    controller = PolicyController(mlp())
+    values = {
+        name: rows[1 if TOPIC_MAP.fields[name].topic == TOPIC_MAP.clock_topic else 0]
+        for name, rows in episode.fields.items()
+    }
+    expected_twist = controller.answer(0, values)["twist"]
+    np.testing.assert_array_equal(answer.command["twist"], expected_twist)
+
+
+def test_topic_that_falls_silent_stops_the_answers_and_is_named(episode):
+    driven = latest("mlp")
+    driven.event(started(episode))
+    answers = fed(driven, shifted(observations(episode, 0), EARLIER_NS))
+    for k in range(1, 9):
+        others = observations(episode, k)
+        silent = [s for s in shifted(others, EARLIER_NS) if s.topic != "phase"]
+        answers += fed(driven, silent)
+    # Of 0.25 s: the sample of step 0 is 7 ms older than its step, and serves four more steps.
+    assert len(answers) == 5
+    assert driven.problem == "pick-1: no sample on phase within 0.25 s"
+    assert len(fed(driven, shifted(observations(episode, 9), EARLIER_NS))) == 1
+    assert driven.problem == ""
+
+
+def test_repeated_clock_is_answered_again(episode):
+    driven = latest("chunked")
+    driven.event(started(episode))
+    first = fed(driven, observations(episode, 0))
+    again = fed(driven, observations(episode, 0))
+    assert [a.stamp_ns for a in first] == [a.stamp_ns for a in again]
+    np.testing.assert_array_equal(first[0].command["twist"], again[0].command["twist"])

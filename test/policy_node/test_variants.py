@@ -11,7 +11,7 @@ from curation_ros.core.errors import ConfigError, PolicyError
 from policy_node.action import CommandTerm
 from policy_node.settings import DEFAULTS, TrainingSettings
 from policy_node.variants import (
-    command_terms_from_text,
+    choose_variant,
     draft_variant,
     read_training_config,
 )
@@ -202,18 +202,30 @@ def test_robot_without_commands_or_observations_has_no_draft():
         draft_variant(replace(TOPIC_MAP.only(["twist"])))
 
 
-# --- on the command line --------------------------------------------------------------------
+# --- the variant that a person asks for -----------------------------------------------------
 
 
-def test_action_of_a_command_line():
-    assert command_terms_from_text("twist=0.2, gripper,b=data") == (
-        CommandTerm("twist", (0.2,)),
-        CommandTerm("gripper"),
-        CommandTerm("b"),
-    )
+def chosen(tmp_path, **asked):
+    variants = {"some": {"observation": ["eef_position"], "action": {"twist": {}}}}
+    return choose_variant(config(tmp_path, variants=variants), TOPIC_MAP, **asked)
 
 
-@pytest.mark.parametrize("text", ["", "twist,", "=0.2", "twist=fast", "twist=0", "twist=nan"])
-def test_action_of_a_command_line_that_makes_no_sense_is_refused(text):
+def test_first_fitting_variant_is_chosen_else_a_draft(tmp_path):
+    assert chosen(tmp_path).name == "some"
+    assert chosen(tmp_path, name="draft") == draft_variant(TOPIC_MAP)
+    assert choose_variant(config(tmp_path), TOPIC_MAP) == draft_variant(TOPIC_MAP)
+
+
+def test_observation_and_action_are_replaced_and_the_name_says_so(tmp_path):
+    made = chosen(tmp_path, observation="phase, bowl_position@start - eef_position")
+    assert made.observation == ("phase", "bowl_position@start - eef_position")
+    assert (made.name, made.action) == ("some-changed", (CommandTerm("twist"),))
+    made = chosen(tmp_path, action="twist=0.2, gripper,b=data")
+    assert made.action == (CommandTerm("twist", (0.2,)), CommandTerm("gripper"), CommandTerm("b"))
+    assert (made.name, made.observation) == ("some-changed", ("eef_position",))
+
+
+@pytest.mark.parametrize("text", ["twist,", "=0.2", "twist=fast", "twist=0", "twist=nan"])
+def test_action_that_makes_no_sense_is_refused(tmp_path, text):
     with pytest.raises(ConfigError, match="action"):
-        command_terms_from_text(text)
+        chosen(tmp_path, action=text)
