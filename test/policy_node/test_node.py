@@ -2,12 +2,33 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import yaml
 from episodes import topic_map
-from graph import MAPPED, JointState, TwistStamped
+from graph import LATCHED, MAPPED, DiagnosticArray, JointState, TwistStamped
 from mlps import mlp
+from other_robots import (
+    CLOSED,
+    OPEN,
+    PERIOD_NS,
+    START_NS,
+    mill,
+    mill_demonstration,
+    samples_of,
+    started,
+)
 from robot import BOWL, PLATE, Robot, libero_take, plain, stamp_ns
+
+from curation_ros.core.episode.episode import Episode
+from curation_ros.core.episode.status import event_to_status
+from curation_ros.nodes.messages import array_to_ros, message_type
+from policy_node.settings import TrainingSettings
+from policy_node.variants import draft_variant
+
+pytest.importorskip("torch")
+
+from policy_node.train import train
 
 pytestmark = [pytest.mark.ros, pytest.mark.policy]
 
@@ -147,3 +168,58 @@ def test_policy_that_does_not_fit_is_one_line_and_code_2(refused, name, complain
     assert (code, len(log.splitlines())) == (2, 1)
     assert log.startswith("error: ")
     assert complaint in log
+
+
+# --- another robot --------------------------------------------------------------------------
+
+
+def test_commands_go_out_on_the_topics_and_types_of_the_robot(other_graph, tmp_path):
+    """A 6-D twist and a gripper with names, units and ends of its own."""
+    graph, mapped = other_graph, mill()
+    fields = mill_demonstration(0)
+    episode = Episode(
+        id="0",
+        name="mill",
+        start_ns=START_NS,
+        end_ns=START_NS + 79 * PERIOD_NS,
+        stamps_ns=START_NS + PERIOD_NS * np.arange(80),
+        fields=fields,
+        topic_map=mapped,
+    )
+    settings = TrainingSettings(steps=5, hidden=(8,))
+    variant = draft_variant(mapped)
+    policy = train([(episode, None)], variant, seed=0, settings=settings).policy
+    path = tmp_path / "mill.yaml"
+    path.write_text(yaml.safe_dump(mapped.to_json()))
+
+    heard = {"mill/jog": [], "mill/clamp": []}
+    for topic, kind in zip(heard, (TwistStamped, JointState), strict=True):
+        graph.node.create_subscription(kind, topic, heard[topic].append, MAPPED)
+    owner = graph.node.create_publisher(DiagnosticArray, "episode", LATCHED)
+    outputs = {
+        topic: graph.node.create_publisher(message_type(kind), topic, MAPPED)
+        for topic, kind in mapped.topics.items()
+        if topic not in heard
+    }
+    graph.start("policy_node", policy=policy.save(tmp_path / "policy"), topic_map=path)
+    owner.publish(array_to_ros([event_to_status(started("mill", 0))], START_NS))
+    first = [s for s in samples_of("mill", 0) if s.stamp_ns == START_NS and s.topic in outputs]
+
+    def answered():
+        # Until it is answered, the first observation is repeated, as the simulator does.
+        for sample in first:
+            outputs[sample.topic].publish(sample.data)
+        graph.quiet(0.1)
+        return all(heard.values())
+
+    graph.until(answered, "the first observation is answered")
+    policy.observe({name: values[0] for name, values in fields.items()})
+    command = policy.act()
+    twist, clamp = heard["mill/jog"][0], heard["mill/clamp"][0]
+    assert stamp_ns(twist) == stamp_ns(clamp) == START_NS
+    assert twist.header.frame_id == "bed"
+    values = plain(twist.twist)
+    assert list(values["linear"].values()) == command["feed"].tolist()
+    assert list(values["angular"].values()) == command["turn"].tolist()
+    assert (list(clamp.name), list(clamp.position)) == (["jaw"], command["clamp"].tolist())
+    assert command["clamp"][0] in (OPEN, CLOSED)
