@@ -10,6 +10,7 @@ import fcntl
 import json
 import os
 import re
+import shutil
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -79,14 +80,9 @@ def write_atomically(
     data = content.encode() if isinstance(content, str) else content
     if make_folder:
         path.parent.mkdir(parents=True, exist_ok=True)
-    # Not a file of `tempfile`: only its owner could read it.
-    name = path.parent / f".{path.name}.{uuid.uuid4().hex}"
-    fd = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    name = _hidden_name(path)
     try:
-        with os.fdopen(fd, "wb") as out:
-            out.write(data)
-            out.flush()
-            os.fsync(out.fileno())
+        _write_synced(name, data)
         if replace:
             os.replace(name, path)
         else:
@@ -98,16 +94,60 @@ def write_atomically(
     sync_folder(path.parent)
 
 
+def write_folder_atomically(folder: Path, files: Mapping[str, str | bytes]) -> None:
+    """Write a new folder with all of its files, or nothing; it is on the disk when this returns.
+
+    Args:
+        folder: must not exist; its parents are made.
+        files: name -> content; text is written as UTF-8.
+
+    Raises:
+        FileExistsError: if the folder exists.
+        OSError: if it cannot be written.
+    """
+    contents = {k: v.encode() if isinstance(v, str) else v for k, v in files.items()}
+    name = _hidden_name(folder)
+    name.mkdir(parents=True)
+    try:
+        for file, content in contents.items():
+            _write_synced(name / file, content)
+        sync_folder(name)
+        if folder.exists():
+            raise _exists(folder)
+        os.rename(name, folder)
+    except BaseException:
+        shutil.rmtree(name, ignore_errors=True)
+        raise
+    sync_folder(folder.parent)
+
+
+def _hidden_name(path: Path) -> Path:
+    """A name beside a path that no other process uses."""
+    return path.parent / f".{path.name}.{uuid.uuid4().hex}"
+
+
+def _write_synced(path: Path, data: bytes) -> None:
+    # Not a file of `tempfile`: only its owner could read it.
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    with os.fdopen(fd, "wb") as out:
+        out.write(data)
+        out.flush()
+        os.fsync(out.fileno())
+
+
+def _exists(path: Path) -> FileExistsError:
+    return FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+
+
 def _rename_to_new(name: Path, path: Path) -> None:
     """Rename a file to a name that does not exist; of several processes, one succeeds."""
-    exists = FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
     try:
         os.link(name, path)  # a rename would replace the file
     except FileExistsError:
-        raise exists from None
+        raise _exists(path) from None
     except OSError:  # a file system without hard links
         if path.exists():
-            raise exists from None
+            raise _exists(path) from None
         os.rename(name, path)
     else:
         os.unlink(name)

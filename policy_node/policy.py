@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -20,6 +18,7 @@ import numpy.typing as npt
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import PolicyError
 from curation_ros.core.types import Floats
+from curation_ros.files import write_folder_atomically
 
 #: Kind on the card -> module and class. A class is imported when a policy of its kind is loaded.
 POLICIES = {
@@ -209,17 +208,12 @@ def write_policy(folder: Path | str, card: Mapping[str, Any], files: Mapping[str
         PolicyError: if it exists or cannot be written.
     """
     folder = Path(folder)
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     text = json.dumps({"format": FORMAT, **card}, indent=1, allow_nan=False) + "\n"
-    if folder.exists():
-        raise PolicyError(f"policy {folder} exists")
     try:
-        partial.mkdir(parents=True)
-        for name, content in {**files, CARD: text.encode()}.items():
-            (partial / name).write_bytes(content)
-        partial.rename(folder)
+        write_folder_atomically(folder, {**files, CARD: text})
+    except FileExistsError as err:
+        raise PolicyError(f"policy {folder} exists") from err
     except OSError as err:
-        shutil.rmtree(partial, ignore_errors=True)
         raise PolicyError(f"policy {folder}: {err.strerror}") from err
     return folder
 

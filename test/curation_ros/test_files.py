@@ -20,6 +20,7 @@ from curation_ros.files import (
     read_lines,
     try_lock,
     write_atomically,
+    write_folder_atomically,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -80,6 +81,22 @@ def test_file_can_be_read_by_those_whom_the_umask_lets(tmp_path: Path) -> None:
     finally:
         os.umask(before)
     assert (tmp_path / "file").stat().st_mode & 0o777 == 0o644
+
+
+def test_folder_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    folder = tmp_path / "a" / "folder"
+    with pytest.raises(UnicodeEncodeError):
+        write_folder_atomically(folder, {"x": b"1", "y": "new \ud800"})
+    with pytest.raises(FileNotFoundError):
+        write_folder_atomically(folder, {"x": b"1", "no/such": "2"})
+    assert not folder.exists()
+    write_folder_atomically(folder, {"x": b"1", "y": "é"})
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == {"x": b"1", "y": "é".encode()}
+    with pytest.raises(FileExistsError) as refused:
+        write_folder_atomically(folder, {"x": b"2"})
+    assert refused.value.filename == str(folder)
+    assert (folder / "x").read_bytes() == b"1"
+    assert [p.name for p in folder.parent.iterdir()] == ["folder"]
 
 
 def test_lock_is_held_until_it_is_released(tmp_path: Path) -> None:
