@@ -13,8 +13,8 @@ from rows import row
 
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.manifests import read_selected, save_selection
-from curation_ros.nodes.evaluate import evaluate_on_graph
 from curation_ros.nodes.processes import Domain, Nodes
+from curation_ros.study.graph_rollouts import evaluate_on_graph
 from curation_ros.study.units import named_variant
 from policy_node.settings import TrainingSettings
 from policy_node.train import train

@@ -26,9 +26,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from curation_ros.cli.output import VERDICT_STYLE, console, percent, print_json
-from curation_ros.extras import how_to_install
-from curation_ros.nodes.demo import START_JITTER_M, Comparison, comparisons, run_demo
-from curation_ros.nodes.demo_events import (
+from curation_ros.demo.events import (
     EVERYTHING,
     KEPT,
     KEPT_AND_SALVAGED,
@@ -43,6 +41,8 @@ from curation_ros.nodes.demo_events import (
     Selected,
     Training,
 )
+from curation_ros.demo.run import START_JITTER_M, Comparison, comparisons, run_demo
+from curation_ros.extras import how_to_install
 from policy_node.settings import DEFAULTS
 
 #: Selection -> how people read it.

@@ -14,7 +14,7 @@ from curation_ros.cli.arguments import add_workers
 from curation_ros.cli.output import percent, print_json, progress_console, say
 from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.errors import ConfigError
-from curation_ros.nodes.evaluate import evaluate_on_graph, summary
+from curation_ros.study.graph_rollouts import evaluate_on_graph, summary
 from sim_node.settings import MAX_STEPS, SIMULATED_TASK
 
 _MOST_STEPS = 100_000  # the limit of sim_node

@@ -14,8 +14,7 @@ from curation_ros.cli.demo import JsonLines, Screen, compared
 from curation_ros.core.episode.findings import Finding
 from curation_ros.core.episode.status import alert_to_status, decision_to_status
 from curation_ros.dataset.dataset import Dataset
-from curation_ros.nodes.demo import comparisons
-from curation_ros.nodes.demo_events import (
+from curation_ros.demo.events import (
     EVERYTHING,
     KEPT,
     KEPT_AND_SALVAGED,
@@ -29,6 +28,7 @@ from curation_ros.nodes.demo_events import (
     Selected,
     Training,
 )
+from curation_ros.demo.run import comparisons
 
 ALL = (EVERYTHING, KEPT, KEPT_AND_SALVAGED)
 ALERT = Alerted(

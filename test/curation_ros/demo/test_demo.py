@@ -19,8 +19,8 @@ from curation_ros.core.episode.status import EpisodeEvent, Status
 from curation_ros.core.errors import CurationError
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.manifests import read_manifest
-from curation_ros.nodes.demo import comparisons, draw, lead_of, select
-from curation_ros.nodes.demo_events import EVERYTHING, KEPT, KEPT_AND_SALVAGED, Drawn
+from curation_ros.demo.events import EVERYTHING, KEPT, KEPT_AND_SALVAGED, Drawn
+from curation_ros.demo.run import comparisons, draw, lead_of, select
 
 DROPS_AT = 140
 

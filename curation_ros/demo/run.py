@@ -23,7 +23,7 @@ from curation_ros.core.types import NS_PER_S
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.episodes import read_episode
 from curation_ros.dataset.manifests import save_selection
-from curation_ros.nodes.demo_events import (
+from curation_ros.demo.events import (
     EVERYTHING,
     KEPT,
     KEPT_AND_SALVAGED,
@@ -38,8 +38,8 @@ from curation_ros.nodes.demo_events import (
     Selected,
     Training,
 )
-from curation_ros.nodes.evaluate import evaluate_on_graph, summary
 from curation_ros.nodes.processes import Domain, Nodes
+from curation_ros.study.graph_rollouts import evaluate_on_graph, summary
 
 if TYPE_CHECKING:
     from curation_ros.core.episode.status import EpisodeEvent, Status
