@@ -29,8 +29,8 @@ class Rollout:
         success: whether the goal held after any step; it ends there.
         steps: commands executed.
         stage: the last phase reached. Phases do not watch the object: a policy that has lost it
-            goes on to RELEASE, as a defective demonstration does.
-        ended: `success`, `max_steps`, or what `GiveUp` says.
+            continues to RELEASE, as a defective demonstration does.
+        ended: `success`, `max_steps`, or the reason of `GiveUp`.
     """
 
     policy: str
@@ -41,12 +41,12 @@ class Rollout:
     ended: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data, as `curation evaluate` prints it, which never gives up."""
+        """Plain data, as `curation evaluate` prints it; evaluate never gives up."""
         return {key: value for key, value in asdict(self).items() if key != "ended"}
 
 
 class SimController:
-    """A policy in the shape that `run_episode` drives; for one episode.
+    """A policy as a controller of the simulator, for one episode.
 
     Args:
         policy: what acts. It is reset, and must drive nothing else meanwhile.
@@ -75,13 +75,12 @@ class SimController:
 
 
 class GiveUp:
-    """Ends a rollout that is as good as lost: a study's steps go where they tell something.
+    """Ends a rollout that is as good as lost, to save the steps of a study; for one rollout.
 
     `lost`: the object lies on the table, at rest, out of reach of the gripper and off the goal, in
     a phase from which the phases never lead back to a grasp. `phase`: the policy has been in one
-    phase for twice as long as the slowest demonstration; a success after that counts as a
-    failure, as one after `max_steps` does. `benchmarks/giving_up.py` counts how often either rule
-    is wrong. For one rollout.
+    phase for twice as long as the slowest demonstration. A success after that counts as a failure,
+    as one after `max_steps` does. `benchmarks/giving_up.py` counts how often either rule is wrong.
     """
 
     #: Steps in one phase; demonstrations take up to 100 in one, and succeed 4 steps into RELEASE.
@@ -99,7 +98,7 @@ class GiveUp:
         self._lying: list[Floats] = []
 
     def __call__(self, step: Step) -> str:
-        """Why to end before this step; empty: go on."""
+        """Reason to end before this step; empty: continue."""
         if step.index == 0:
             self._height_m = float(step.observation.objects[self._names[0]][0][2])
         self._phase_steps = self._phase_steps + 1 if step.phase_index == self._phase else 1

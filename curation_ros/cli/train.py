@@ -72,7 +72,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="print the variant as a config, by default the draft, and train nothing",
     )
-    parser.add_argument("--report", type=Path, help="file that gets a line of steps now and then")
+    parser.add_argument(
+        "--report", type=Path, help="file for progress: the number of steps, line by line"
+    )
     parser.add_argument("--out", type=Path, help="folder of the policy; default: in the dataset")
     own = ("steps", "start_jitter_m")
     others = (f for f in fields(TrainingSettings) if f.name not in own)

@@ -76,7 +76,7 @@ class Driven:
 def driven(graph, folder):
     """A whole episode; recorder and policy discover each other only when it has begun.
 
-    The sim knows both then. A recorder that is stopped is on the graph, and answers nobody.
+    The sim has found both by then. A recorder that is stopped is on the graph without answering.
     """
     dataset = graph.folder / "driven"
     graph.start("recorder", dataset=dataset)
@@ -302,7 +302,7 @@ def other_phases(card):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "words"),
     [
         (other_columns, "columns: found "),
         (other_width, "expected float32 (257, 21)"),
@@ -314,7 +314,7 @@ def other_phases(card):
 )
 @pytest.mark.parametrize("how", [["--graph"], []])
 def test_policy_that_does_not_fit_is_one_line_and_no_process(
-    folder, tmp_path, capsys, change, said, how
+    folder, tmp_path, capsys, change, words, how
 ):
     spoiled = tmp_path / "policy"
     if change is not None:
@@ -327,6 +327,6 @@ def test_policy_that_does_not_fit_is_one_line_and_no_process(
     out, err = capsys.readouterr()
     assert (code, out) == (3, "")
     assert err.startswith("error: ")
-    assert said in err
+    assert words in err
     assert len(err.splitlines()) == 1
     assert not logs.exists()  # no node was started

@@ -47,23 +47,23 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def answers(graph, folder):
     """A robot without commands of its own, and what the policy node has answered."""
-    # First, so that the policy node knows of them when it is heard.
-    heard = {topic: [] for topic in COMMANDS}
+    # First, so that the policy node has found them when its first command is received.
+    received = {topic: [] for topic in COMMANDS}
     for topic, kind in zip(COMMANDS, (TwistStamped, JointState), strict=True):
-        graph.node.create_subscription(kind, topic, heard[topic].append, MAPPED)
+        graph.node.create_subscription(kind, topic, received[topic].append, MAPPED)
     graph.start("policy_node", policy=folder)
     types = {t: kind for t, kind in topic_map().topics.items() if t not in COMMANDS}
     with Robot(graph, types=types) as robot:
         robot.until_found(topics=["eef_pose", "phase", BOWL, PLATE])
-        yield Answers(graph, robot, heard)
+        yield Answers(graph, robot, received)
     graph.stop("policy_node")
 
 
 class Answers:
-    def __init__(self, graph, robot, heard):
+    def __init__(self, graph, robot, received):
         self.graph = graph
         self.robot = robot
-        self.heard = heard
+        self.received = received
 
     def begin(self):
         """Start an episode; returns the messages of its steps."""
@@ -73,14 +73,14 @@ class Answers:
         steps = [observations[k : k + n] for k in range(0, len(observations), n)]
         # The first observation is at the start stamp, as the sim has it.
         started = type(take.started)(take.id, take.name, "started", stamp_ns(observations[0][1]))
-        for commands in self.heard.values():
+        for commands in self.received.values():
             commands.clear()
         self.robot.tell(started)
         return steps
 
     def until(self, n):
-        self.graph.until(lambda: all(len(c) >= n for c in self.heard.values()), f"{n} answers")
-        return [plain(self.heard[topic][n - 1]) for topic in COMMANDS]
+        self.graph.until(lambda: all(len(c) >= n for c in self.received.values()), f"{n} answers")
+        return [plain(self.received[topic][n - 1]) for topic in COMMANDS]
 
 
 def test_answers_carry_the_stamp_of_their_observation(answers):
@@ -88,7 +88,7 @@ def test_answers_carry_the_stamp_of_their_observation(answers):
         answers.robot.send(step)
         twist, gripper = answers.until(n)
         assert twist["header"]["stamp"] == gripper["header"]["stamp"]
-        assert stamp_ns(answers.heard[COMMANDS[0]][-1]) == stamp_ns(step[0][1])
+        assert stamp_ns(answers.received[COMMANDS[0]][-1]) == stamp_ns(step[0][1])
         assert gripper["name"] == ["gripper"]
         assert gripper["position"][0] in (-1.0, 0.0, 1.0)
         assert all(abs(v) <= 1.0 for v in twist["twist"]["linear"].values())
@@ -111,17 +111,17 @@ def test_incomplete_observation_waits_for_its_last_topic(answers):
     *others, tool = first
     answers.robot.send([*others, *second[:-1]])  # of the next one something is there already
     answers.graph.quiet(0.3)
-    assert not answers.heard[COMMANDS[0]]
+    assert not answers.received[COMMANDS[0]]
     answers.robot.send([tool])
     answers.until(1)
-    assert stamp_ns(answers.heard[COMMANDS[0]][0]) == stamp_ns(first[0][1])
+    assert stamp_ns(answers.received[COMMANDS[0]][0]) == stamp_ns(first[0][1])
 
 
 def test_episode_joined_in_its_middle_is_not_driven(answers):
     steps = answers.begin()
     answers.robot.send(steps[3])
     answers.graph.problem("policy_node", "its first observation was not received: not driving it")
-    assert not answers.heard[COMMANDS[0]]
+    assert not answers.received[COMMANDS[0]]
 
 
 # --- errors ---------------------------------------------------------------------------------
@@ -192,14 +192,14 @@ def test_commands_go_out_on_the_topics_and_types_of_the_robot(other_graph, tmp_p
     path = tmp_path / "mill.yaml"
     path.write_text(yaml.safe_dump(mapped.to_json()))
 
-    heard = {"mill/jog": [], "mill/clamp": []}
-    for topic, kind in zip(heard, (TwistStamped, JointState), strict=True):
-        graph.node.create_subscription(kind, topic, heard[topic].append, MAPPED)
+    received = {"mill/jog": [], "mill/clamp": []}
+    for topic, kind in zip(received, (TwistStamped, JointState), strict=True):
+        graph.node.create_subscription(kind, topic, received[topic].append, MAPPED)
     owner = graph.node.create_publisher(DiagnosticArray, "episode", LATCHED)
     outputs = {
         topic: graph.node.create_publisher(message_type(kind), topic, MAPPED)
         for topic, kind in mapped.topics.items()
-        if topic not in heard
+        if topic not in received
     }
     graph.start("policy_node", policy=policy.save(tmp_path / "policy"), topic_map=path)
     owner.publish(array_to_ros([event_to_status(started("mill", 0))], START_NS))
@@ -210,12 +210,12 @@ def test_commands_go_out_on_the_topics_and_types_of_the_robot(other_graph, tmp_p
         for sample in first:
             outputs[sample.topic].publish(sample.data)
         graph.quiet(0.1)
-        return all(heard.values())
+        return all(received.values())
 
     graph.until(answered, "the first observation is answered")
     policy.observe({name: values[0] for name, values in fields.items()})
     command = policy.act()
-    twist, clamp = heard["mill/jog"][0], heard["mill/clamp"][0]
+    twist, clamp = received["mill/jog"][0], received["mill/clamp"][0]
     assert stamp_ns(twist) == stamp_ns(clamp) == START_NS
     assert twist.header.frame_id == "bed"
     values = plain(twist.twist)

@@ -176,7 +176,7 @@ def test_draft_centers_commands_that_are_places():
     }
     made = draft_variant(topic_map_from_json(raw))
     assert made.observation == ("joints",)
-    # Nothing says what the numbers of the hand mean: it is a command as others are.
+    # The meaning of the hand's numbers is not declared, so it is a command like any other.
     assert made.action == (
         CommandTerm("goal", center=()),
         CommandTerm("speed"),

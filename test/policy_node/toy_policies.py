@@ -46,8 +46,8 @@ class ChunkedPolicy:
     """Plans the commands of the next H steps at once, as ACT and diffusion policies do.
 
     The plan closes in on the place where the episode began. Without temporal ensembling a chunk
-    is followed to its end; with it, each step makes a chunk, and the command is the mean of what
-    all chunks say about the step.
+    is followed to its end; with it, each step makes a chunk, and the command is the mean of
+    all chunks for the step.
     """
 
     observed = ("eef_position",)
@@ -79,12 +79,12 @@ class ChunkedPolicy:
     def act(self) -> Command:
         if self._step < 0:
             raise PolicyError("nothing was observed")
-        says = [
+        planned = [
             chunk[self._step - first]
             for first, chunk in self._chunks.items()
             if self._step - first < self.horizon
         ]
-        command = np.mean(says, axis=0)
+        command = np.mean(planned, axis=0)
         return {"twist": command[:3], "gripper": np.sign(command[3:])}
 
     def _plan(self, place: np.ndarray) -> np.ndarray:

@@ -17,19 +17,21 @@ def _selection(curation: Run, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("content", [None, "{", "", "5", "{}", "not json"])
-def test_selection_that_is_none_is_told(curation: Run, folder: Path, content: str | None) -> None:
+def test_selection_that_is_none_is_refused(
+    curation: Run, folder: Path, content: str | None
+) -> None:
     path = folder / "data" / "selections" / "bad.json"
     if content is not None:
         path.parent.mkdir()
         path.write_text(content)
-    told = curation("train", "--selection", path, "--json")
-    assert (told.code, told.out) == (USAGE, "")
-    assert str(path) in told.err
-    assert len(told.err.splitlines()) == 1
+    answer = curation("train", "--selection", path, "--json")
+    assert (answer.code, answer.out) == (USAGE, "")
+    assert str(path) in answer.err
+    assert len(answer.err.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
-    ("change", "code", "said"),
+    ("change", "code", "words"),
     [
         ({"entries": [{"episode": "nobody", "name": "x", "span": None}]}, NOTHING, "nobody"),
         ({"entries": []}, USAGE, "nothing to train on"),
@@ -38,37 +40,39 @@ def test_selection_that_is_none_is_told(curation: Run, folder: Path, content: st
         ({"kept_of": "many"}, USAGE, "many"),
     ],
 )
-def test_selection_that_makes_no_sense_is_told(
-    curation: Run, folder: Path, change: dict[str, Any], code: int, said: str
+def test_selection_that_makes_no_sense_is_refused(
+    curation: Run, folder: Path, change: dict[str, Any], code: int, words: str
 ) -> None:
     path = _selection(curation, folder)
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    told = curation("train", "--selection", path, "--json")
-    assert (told.code, told.out) == (code, "")
-    assert said in told.err
-    assert len(told.err.splitlines()) == 1
+    answer = curation("train", "--selection", path, "--json")
+    assert (answer.code, answer.out) == (code, "")
+    assert words in answer.err
+    assert len(answer.err.splitlines()) == 1
 
 
 @pytest.mark.parametrize("content", [None, "{", "5", "{}"])
-def test_policy_that_is_none_is_told(curation: Run, tmp_path: Path, content: str | None) -> None:
+def test_policy_that_is_none_is_refused(
+    curation: Run, tmp_path: Path, content: str | None
+) -> None:
     pytest.importorskip("safetensors")
     folder = tmp_path / "policy"
     if content is not None:
         folder.mkdir()
         (folder / "card.json").write_text(content)
-    told = curation("evaluate", "--policy", folder, "--json")
-    assert (told.code, told.out) == (NOTHING, "")
-    assert str(folder) in told.err
-    assert len(told.err.splitlines()) == 1
+    answer = curation("evaluate", "--policy", folder, "--json")
+    assert (answer.code, answer.out) == (NOTHING, "")
+    assert str(folder) in answer.err
+    assert len(answer.err.splitlines()) == 1
 
 
 @pytest.mark.policy
 def test_path_from_bags_to_a_policy(curation: Run, folder: Path) -> None:
     pytest.importorskip("torch")
     path = _selection(curation, folder)
-    told = curation("train", "--selection", path, "--steps", 5, "--seed", 3, "--json")
-    assert told.code == DONE, told.err
-    [row] = told.rows
+    answer = curation("train", "--selection", path, "--steps", 5, "--seed", 3, "--json")
+    assert answer.code == DONE, answer.err
+    [row] = answer.rows
     assert list(row) == ["policy", "loss", "steps", "seconds", "variant", "clipped"]
     assert (row["steps"], row["variant"]) == (5, "relative")
     assert list(row["clipped"]) == ["twist"]
@@ -79,7 +83,7 @@ def test_path_from_bags_to_a_policy(curation: Run, folder: Path) -> None:
     assert sorted(e["id"] for e in card["episodes"]) == sorted(
         e["episode"] for e in manifest["entries"]
     )
-    for arguments, said in (
+    for arguments, words in (
         (["--steps", "0"], "steps"),
         (["--variant", "nose"], "nose"),
         (["--seed", "-1"], "seed"),
@@ -90,26 +94,28 @@ def test_path_from_bags_to_a_policy(curation: Run, folder: Path) -> None:
         wrong = curation("train", "--selection", path, "--steps", "5", *arguments, "--json")
         assert wrong.code in (USAGE, NOTHING), wrong.err
         assert (wrong.out, len(wrong.err.splitlines())) == ("", 1)
-        assert said in wrong.err
+        assert words in wrong.err
 
 
 @pytest.mark.sim
 @pytest.mark.policy
-def test_starts_that_make_no_sense_are_told(curation: Run, folder: Path) -> None:
+def test_starts_that_make_no_sense_are_refused(curation: Run, folder: Path) -> None:
     pytest.importorskip("torch")
     pytest.importorskip("mujoco")
     path = _selection(curation, folder)
     [row] = curation("train", "--selection", path, "--steps", 2, "--json").rows
     for starts in ("nonsense", "official:0:0", "official:0:51", "0:50", "", "official:5:2"):
-        told = curation("evaluate", "--policy", row["policy"], "--starts", starts, "--json")
-        assert (told.code, told.out) == (USAGE, ""), starts
-        assert f"starts {starts!r}" in told.err
+        answer = curation("evaluate", "--policy", row["policy"], "--starts", starts, "--json")
+        assert (answer.code, answer.out) == (USAGE, ""), starts
+        assert f"starts {starts!r}" in answer.err
     other = ["--simulated-task", "dance", "--json"]
-    told = curation("evaluate", "--policy", row["policy"], *other)
-    assert (told.code, told.out) == (USAGE, "")
-    assert told.err.startswith("error: simulated task 'dance' is unknown; known: bowl_on_plate, ")
+    answer = curation("evaluate", "--policy", row["policy"], *other)
+    assert (answer.code, answer.out) == (USAGE, "")
+    assert answer.err.startswith(
+        "error: simulated task 'dance' is unknown; known: bowl_on_plate, "
+    )
     for more in ([], ["--graph"]):
         steps = ["--starts", "official:0:1", "--max-steps", "0", *more]
-        told = curation("evaluate", "--policy", row["policy"], *steps, "--json")
-        assert (told.code, told.out) == (USAGE, "")
-        assert told.err == "error: --max-steps 0: expected 1 to 100000\n"
+        answer = curation("evaluate", "--policy", row["policy"], *steps, "--json")
+        assert (answer.code, answer.out) == (USAGE, "")
+        assert answer.err == "error: --max-steps 0: expected 1 to 100000\n"

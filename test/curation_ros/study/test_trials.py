@@ -244,7 +244,7 @@ def test_diverged_simulation_fails_its_rollout_and_its_steps_count(
     assert len(study.roll(rollouts(units[:1], STARTS[:1])).done) == 1
 
 
-#: Kills, again and again, whoever reads a pipe.
+#: Kills each process that reads a pipe.
 KILLER = """
 import os, signal, sys
 from pathlib import Path
@@ -264,7 +264,7 @@ while True:
 def test_worker_that_dies_costs_its_own_unit_alone(
     study: PolicyTrials, units: list[PolicyUnit]
 ) -> None:
-    """A policy that is a pipe: who opens it waits, and is killed while it does."""
+    """A policy that is a pipe: a worker that opens it waits, and is killed meanwhile."""
     card = policy_folder(study.folder, units[0].key) / "card.json"
     text = card.read_bytes()
     card.unlink()
