@@ -18,7 +18,7 @@ from curation_ros.configuration import (
 from curation_ros.core.decision.rules import RULES
 from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.topic_map import read_topic_map
-from curation_ros.core.errors import BagError, ConfigError
+from curation_ros.core.errors import ConfigError, EpisodeError
 from curation_ros.core.scorers import DEFAULT_SCORERS
 from curation_ros.dataset.dataset import Dataset
 
@@ -196,7 +196,7 @@ def test_reference_is_every_bag_of_what_is_named(
         assert all(same_arrays(read[e.id], e) for e in episodes)
     (tmp_path / "empty").mkdir()
     for path in (tmp_path / "empty", tmp_path / "none"):
-        with pytest.raises(BagError, match=str(path)):
+        with pytest.raises(EpisodeError, match=str(path)):
             read_reference([path], None)
     with pytest.raises(ConfigError, match="no episode"):
         read_reference([], None)
