@@ -176,27 +176,6 @@ def _pool(folder: Path, name: str, plan: StudyPlan, rng: np.random.Generator) ->
         for scorer in plan.scorers
     }
     needs = {s: ("pool",) if s.endswith("_free") else ("reference",) for s in plan.scorers}
-    labels = np.array(list(good.values()))
-    audited = []
-    for scorer, some in scores.items():
-        auroc = detection.auroc(list(some.values()), labels)
-        interval = list(detection.auroc_interval(auroc, n_good, n - n_good))
-        paper = TABLE_1.get(scorer)
-        audited.append(
-            {
-                "scorer": scorer,
-                "needs": needs[scorer][0],
-                "auroc_raw": min(1.0, auroc + 0.1),
-                "ci_raw": interval,
-                "auroc_controlled": auroc,
-                "ci": interval,
-                "keep": plan.keep_for_audit,
-                "precision": 0.25,
-                "clean_recall": 0.5,
-                "paper": paper.to_json() if paper else None,
-                "notes": ["12 abstained: <why>"] if scorer == "entropy" else [],
-            }
-        )
     curated, timelines, curator = None, {}, {}
     if any(term.name in DECIDED for term in plan.terms(name)):
         carried = list(_carried(good, rng))
@@ -213,7 +192,7 @@ def _pool(folder: Path, name: str, plan: StudyPlan, rng: np.random.Generator) ->
         good=good,
         scores=scores,
         needs=needs,
-        audited=audited,
+        audited=[_audited(scorer, scores[scorer], good, needs[scorer], plan) for scorer in scores],
         notes=["a note of the audit"],
         traces=[_trace(i, good[i]) for i in ids],
         facts={
@@ -232,6 +211,33 @@ def _pool(folder: Path, name: str, plan: StudyPlan, rng: np.random.Generator) ->
         timelines=timelines,
         curated=curated,
     )  # fmt: skip
+
+
+def _audited(
+    scorer: str,
+    scores: dict[str, float],
+    good: dict[str, bool],
+    needs: tuple[str, ...],
+    plan: StudyPlan,
+) -> dict[str, Any]:
+    """The row of an audit on these scores."""
+    n_good = sum(good.values())
+    auroc = detection.auroc(list(scores.values()), list(good.values()))
+    interval = list(detection.auroc_interval(auroc, n_good, len(good) - n_good))
+    paper = TABLE_1.get(scorer)
+    return {
+        "scorer": scorer,
+        "needs": needs[0],
+        "auroc_raw": min(1.0, auroc + 0.1),
+        "ci_raw": interval,
+        "auroc_controlled": auroc,
+        "ci": interval,
+        "keep": plan.keep_for_audit,
+        "precision": 0.25,
+        "clean_recall": 0.5,
+        "paper": paper.to_json() if paper else None,
+        "notes": ["12 abstained: <why>"] if scorer == "entropy" else [],
+    }
 
 
 def _carried(good: dict[str, bool], rng: np.random.Generator) -> Iterator[tuple[Episode, int]]:
