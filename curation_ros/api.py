@@ -12,7 +12,13 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias, overload
 
-from curation_ros.batch.score import Scored, ScoringResult, Unreadable, score_bags, score_episodes
+from curation_ros.batch.score import (
+    Scored,
+    ScoringResult,
+    Unreadable,
+    score_episodes,
+    score_recordings,
+)
 from curation_ros.configuration import read_reference, settings_of
 from curation_ros.core.decision.decision import VERDICTS, Decision
 from curation_ros.core.decision.manifest import Manifest
@@ -323,7 +329,7 @@ def score(
         return ScoredEpisodes(score_episodes(episodes, settings, trusted))
     find_episodes(paths)  # a path with nothing in it is a mistake in the call
     return ScoredEpisodes(
-        score_bags(paths, settings, trusted, topic_map=topic_map, write=write, jobs=jobs)
+        score_recordings(paths, settings, trusted, topic_map=topic_map, write=write, jobs=jobs)
     )
 
 

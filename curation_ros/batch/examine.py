@@ -1,8 +1,8 @@
-"""Many bags to examinations: spread over workers, and kept, so that a stopped run resumes.
+"""Many episodes to examinations: spread over workers, and kept, so that a stopped run resumes.
 
-An examination is a function of a bag and of the fitted scorers. It is computed once and kept under
-the hash of both: in the index of the dataset, or in the user's cache for bags outside of datasets.
-Rules and decisions cost next to nothing in comparison.
+An examination is a function of a recording and of the fitted scorers. It is computed once and kept
+under the hash of both: in the index of the dataset, or in the user's cache for recordings outside
+of datasets. Rules and decisions cost next to nothing in comparison.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from curation_ros.dataset.index import Index
 from curation_ros.dataset.layout import home_of
 from curation_ros.version import __version__
 
-# Bags that a worker gets at once. Fitted scorers of about 100 kB go with them.
+# Episodes that a worker gets at once. Fitted scorers of about 100 kB go with them.
 _BATCH = 16
 
 
 @dataclass(frozen=True)
 class Examined:
-    """A bag and what was found in it.
+    """An episode on disk and what was found in it.
 
     Attributes:
-        path: the bag.
+        path: of the episode, as `find_episodes` gives it.
         result: its examination, or why it could not be read.
         is_known: whether the examination was kept from an earlier run.
     """
@@ -44,7 +44,7 @@ class Examined:
 
 
 class Examiner:
-    """Examines bags with the same fitted scorers; the same bags may be examined again.
+    """Examines episodes with the same fitted scorers; an episode may be examined again.
 
     Attributes:
         problem: why results could not be kept in the index; empty if they could.
@@ -63,10 +63,10 @@ class Examiner:
 
         Args:
             fitted: the scorers to ask.
-            topic_map: how episodes are built; None: by the map in each bag.
+            topic_map: how episodes are built; None: by the map in each recording.
             jobs: workers; 1 works in this process, -1 takes all cores.
             backend: one of BACKENDS; it matters with several workers.
-            fresh: examine bags whose examinations were kept, too, but each only once.
+            fresh: examine episodes whose examinations were kept, too, but each only once.
 
         Raises:
             ConfigError: for a backend that does not exist, or is not installed.
@@ -79,16 +79,16 @@ class Examiner:
         self._done: set[Path] = set()
         self.problem = ""
 
-    def run(self, bags: Sequence[Path]) -> Iterator[Examined]:
-        """Examine bags, in their order; each result is kept at once.
+    def run(self, paths: Sequence[Path]) -> Iterator[Examined]:
+        """Examine episodes, in their order; each result is kept at once.
 
         Memory does not grow with their number: workers get only a few batches ahead.
 
         Raises:
             CurationError: if a worker died. The examinations before that are kept.
         """
-        batches = [bags[k : k + _BATCH] for k in range(0, len(bags), _BATCH)]
-        # A bag that this examiner has examined afresh is not examined afresh again.
+        batches = [paths[k : k + _BATCH] for k in range(0, len(paths), _BATCH)]
+        # What this examiner has examined afresh is not examined afresh again.
         jobs = ((b, self._fresh and not self._done.issuperset(b)) for b in batches)
         for batch, stamps in self._spread(jobs):
             self._keep(batch, stamps)
@@ -111,7 +111,7 @@ class Examiner:
             e.path: e.result for e in batch if not e.is_known and isinstance(e.result, Examination)
         }
         for some in _by_folder(fresh):
-            found = {bag: fresh[bag] for bag in some}
+            found = {path: fresh[path] for path in some}
             try:
                 Index.covering(some[0]).keep_examinations(self._task.key, found, stamps)
             except CurationError as err:
@@ -120,41 +120,41 @@ class Examiner:
 
 @dataclass(frozen=True)
 class _Task:
-    """What a worker does with a batch of bags; it is sent to the worker as a whole."""
+    """What a worker does with a batch of episodes; it is sent to the worker as a whole."""
 
     fitted: FittedScorers
     topic_map: TopicMap | None
     key: str
 
     def __call__(
-        self, bags: Sequence[Path], fresh: bool
+        self, paths: Sequence[Path], fresh: bool
     ) -> tuple[list[Examined], dict[Path, str]]:
-        """Results in the order of the bags, and stamps of their files before they were read."""
-        stamps = {bag: stamp_of(bag) for bag in bags}
+        """Results in the order of the paths, and their stamps from before they were read."""
+        stamps = {path: stamp_of(path) for path in paths}
         known: dict[Path, Examination] = {}
         if not fresh:
-            for some in _by_folder(bags):
+            for some in _by_folder(paths):
                 with suppress(CurationError):  # no index, or a busy one: examine them again
                     index = Index.covering(some[0])
-                    known |= index.examinations(self.key, {bag: stamps[bag] for bag in some})
+                    known |= index.examinations(self.key, {path: stamps[path] for path in some})
         results = []
-        for bag in bags:
-            if bag in known:
-                results.append(Examined(bag, known[bag], is_known=True))
+        for path in paths:
+            if path in known:
+                results.append(Examined(path, known[path], is_known=True))
                 continue
             try:
-                found = examine(self.fitted, read_episode(bag, self.topic_map))
-                results.append(Examined(bag, found, is_known=False))
+                found = examine(self.fitted, read_episode(path, self.topic_map))
+                results.append(Examined(path, found, is_known=False))
             except CurationError as err:
-                results.append(Examined(bag, err, is_known=False))
+                results.append(Examined(path, err, is_known=False))
         return results, stamps
 
 
-def _by_folder(bags: Iterable[Path]) -> list[list[Path]]:
-    """Bags grouped by the index that covers them."""
+def _by_folder(paths: Iterable[Path]) -> list[list[Path]]:
+    """Paths grouped by the index that covers them."""
     grouped: dict[Path, list[Path]] = {}
-    for bag in bags:
-        grouped.setdefault(home_of(bag)[0], []).append(bag)
+    for path in paths:
+        grouped.setdefault(home_of(path)[0], []).append(path)
     return list(grouped.values())
 
 
@@ -164,25 +164,25 @@ def _key(fitted: FittedScorers, topic_map: TopicMap | None) -> str:
     return f"{__version__}+{fitted.scoring_hash}{by}"
 
 
-class EpisodesOf:
-    """The readable episodes of bags, each once; they are read again in each iteration."""
+class ReadableEpisodes:
+    """The episodes at some paths that can be read, each once; each iteration reads them again."""
 
-    def __init__(self, bags: Sequence[Path], topic_map: TopicMap | None) -> None:
-        """Store which bags to read.
+    def __init__(self, paths: Sequence[Path], topic_map: TopicMap | None) -> None:
+        """Store what to read.
 
         Args:
-            bags: paths for `read_episode`.
-            topic_map: how episodes are built; None: by the map in each bag.
+            paths: of the episodes.
+            topic_map: how episodes are built; None: by the map in each recording.
         """
-        self._bags = bags
+        self._paths = paths
         self._topic_map = topic_map
 
     def __iter__(self) -> Iterator[Episode]:
         ids = set()
-        for bag in self._bags:
+        for path in self._paths:
             try:
-                episode = read_episode(bag, self._topic_map)
-            except CurationError:  # reported when the bag is examined
+                episode = read_episode(path, self._topic_map)
+            except CurationError:  # reported when it is examined
                 continue
             if episode.id not in ids:
                 ids.add(episode.id)

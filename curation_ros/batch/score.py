@@ -1,4 +1,4 @@
-"""Score bags and decide on them: what `curation score`, `~/curate` and `self-check` do."""
+"""Score episodes and decide on them: what `curation score`, `~/curate` and `self-check` do."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from curation_ros.batch.copies import Copies
-from curation_ros.batch.examine import EpisodesOf, Examined, Examiner
+from curation_ros.batch.examine import Examined, Examiner, ReadableEpisodes
 from curation_ros.batch.workers import check_workers
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import CURATOR, Decision, Verdict, in_force
@@ -29,10 +29,10 @@ from curation_ros.dataset.layout import home_of, is_dataset
 
 @dataclass(frozen=True)
 class Scored:
-    """A bag that was scored and decided on.
+    """An episode that was scored and decided on.
 
     Attributes:
-        path: the bag; for an episode in memory, its id.
+        path: of its recording; for an episode in memory, its id.
         examination: what was found in it.
         decision: what becomes of it. With logging it is the decision in force, which may be a
             person's; scores and findings are those of now in any case.
@@ -81,10 +81,10 @@ class Scored:
 
 @dataclass(frozen=True)
 class Unreadable:
-    """A path without a bag, or a bag that cannot be read.
+    """A path without a recording, or a recording that cannot be read.
 
     Attributes:
-        path: as given, or the bag.
+        path: as given, or of the recording.
         error: what is wrong with it.
     """
 
@@ -106,13 +106,13 @@ class ScoringCounts:
     """Counts over the results of a run.
 
     Attributes:
-        verdicts: verdict -> bags with that decision.
-        n_known: bags whose examination was kept from an earlier run.
-        n_unreadable: paths without a bag, and bags that could not be read.
+        verdicts: verdict -> episodes with that decision.
+        n_known: episodes with an examination that was kept from an earlier run.
+        n_unreadable: paths without a recording, and recordings that could not be read.
         n_in_reference: scored episodes that are in the reference, too.
-        n_with_findings: bags with a finding.
+        n_with_findings: episodes with a finding.
         replaced: (verdict before, verdict now) -> decisions that logging has changed.
-        overridden: results whose verdict a person has overridden.
+        overridden: results with a verdict that a person has overridden.
     """
 
     verdicts: Counter[Verdict] = field(default_factory=Counter)
@@ -125,7 +125,7 @@ class ScoringCounts:
 
     @property
     def n_scored(self) -> int:
-        """Bags that were scored."""
+        """Episodes that were scored."""
         return self.verdicts.total()
 
     def add(self, result: ScoringResult, reference_ids: Sequence[str]) -> None:
@@ -145,13 +145,13 @@ class ScoringCounts:
 
 
 class Scoring:
-    """A run over bags: iterate it for the results, then read the counts.
+    """A run over recordings: iterate it for the results, then read the counts.
 
-    Results come in the order of the bags, paths without a bag first. Each result is logged and
-    kept before the next one is computed, so that a stopped run loses nothing.
+    Results come in the order of the recordings, paths without one first. Each result is kept and
+    logged before it is given, so that a stopped run loses nothing.
 
     Attributes:
-        bags: the bags to score.
+        paths: of the recordings.
         curation: what scores and decides. During the run it is fitted on the dataset, if one of
             its scorers needs that.
         counts: over the results so far.
@@ -160,7 +160,7 @@ class Scoring:
 
     def __init__(
         self,
-        bags: Sequence[Path],
+        paths: Sequence[Path],
         curation: Curation,
         *,
         topic_map: TopicMap | None = None,
@@ -173,12 +173,13 @@ class Scoring:
         """Store what to score; nothing is read yet.
 
         Args:
-            bags: in the order of their ids, so that of two copies the older one is the original.
+            paths: of the recordings, in the order of their ids. Then the older one of two copies
+                counts as the original.
             curation: fitted on the reference.
-            topic_map: how episodes are built; None: by the map in each bag.
-            log: dataset of the bags, to log the decisions in; None: nothing is logged.
-            unreadable: paths without a bag.
-            fresh: examine bags whose examinations were kept, too.
+            topic_map: how episodes are built; None: by the map in each recording.
+            log: dataset of the recordings, to log the decisions in; None: nothing is logged.
+            unreadable: paths without a recording.
+            fresh: examine recordings with an examination that was kept, too.
             jobs: workers; 1 works in this process, -1 takes all cores.
             backend: one of BACKENDS; it matters with several workers.
 
@@ -186,7 +187,7 @@ class Scoring:
             ConfigError: for a backend that does not exist, or is not installed.
         """
         check_workers(jobs, backend)
-        self.bags = bags
+        self.paths = paths
         self.curation = curation
         self.counts = ScoringCounts()
         self.problem = ""
@@ -216,7 +217,7 @@ class Scoring:
     def _results(self, progress: Progress) -> Iterator[ScoringResult]:
         yield from self._unreadable
         if self.curation.scorers.needs_dataset:
-            episodes = EpisodesOf(self.bags, self._topic_map)
+            episodes = ReadableEpisodes(self.paths, self._topic_map)
             self.curation = self.curation.fit_dataset(episodes)
         examiner = Examiner(
             self.curation.scorers,
@@ -225,7 +226,9 @@ class Scoring:
             backend=self._backend,
             fresh=self._fresh,
         )
-        for result in _decided(self.curation, examiner, self.bags, progress):
+        tie = _tie_of(self.paths) if self.curation.rule_needs_dataset else None
+        decided = _decided(self.curation, lambda: examiner.run(self.paths), tie, progress)
+        for result in decided:
             self.problem = examiner.problem
             if isinstance(result, Unreadable):
                 yield result
@@ -242,7 +245,7 @@ class Scoring:
         return replace(scored, overridden_by=held)
 
 
-def score_bags(
+def score_recordings(
     paths: Iterable[Path],
     settings: CurationSettings | None = None,
     reference: Iterable[Episode] = (),
@@ -253,17 +256,17 @@ def score_bags(
     jobs: int = 1,
     backend: str = "loky",
 ) -> Scoring:
-    """Score bags and decide on them.
+    """Score recordings and decide on them.
 
-    The reference is fitted at once; bags are read as the returned run is iterated.
+    The scorers are fitted on the reference at once. Recordings are read as the run is iterated.
 
     Args:
-        paths: datasets, bags, folders of bags, .mcap files.
+        paths: datasets, recordings, and files or folders of recordings (see `find_episodes`).
         settings: what scores and what decides; by default those of `CurationSettings`.
         reference: trusted demonstrations; may be empty.
-        topic_map: how episodes are built; None: by the map in each bag.
+        topic_map: how episodes are built; None: by the map in each recording.
         write: log the decisions in the dataset, which is then the only path.
-        fresh: examine bags whose examinations were kept, too.
+        fresh: examine recordings with an examination that was kept, too.
         jobs: workers; 1 works in this process, -1 takes all cores.
         backend: one of BACKENDS; it matters with several workers.
 
@@ -277,9 +280,9 @@ def score_bags(
         raise ConfigError(f"decisions are written into one dataset, found {len(given)} paths")
     log = Dataset(given[0]) if write else None
     curation = Curation.fit(settings, reference)
-    bags, unreadable = _find(given)
+    found, unreadable = _find(given)
     return Scoring(
-        bags,
+        found,
         curation,
         topic_map=topic_map,
         log=log,
@@ -309,22 +312,10 @@ def score_episodes(
     curation = Curation.fit(settings, reference)
     if curation.scorers.needs_dataset:
         curation = curation.fit_dataset(given)
-    for result in _decided(curation, _InMemory(curation, given), (), iter):
+    examined = [Examined(Path(e.id), curation.examine(e), is_known=False) for e in given]
+    for result in _decided(curation, lambda: examined, None, iter):
         if isinstance(result, Scored):
             yield result
-
-
-class _InMemory:
-    """Examines episodes that were read already; the id of each stands for its path."""
-
-    def __init__(self, curation: Curation, episodes: Sequence[Episode]) -> None:
-        self._examined = [
-            Examined(Path(e.id), curation.examine(e), is_known=False) for e in episodes
-        ]
-
-    def run(self, bags: Sequence[Path]) -> Iterator[Examined]:
-        """All of them, whatever bags are named."""
-        return iter(self._examined)
 
 
 def decide_dataset(
@@ -333,9 +324,9 @@ def decide_dataset(
     """Decide on every bag of a dataset, with all of them in view, and log what is new.
 
     Args:
-        dataset: its bags. Those whose examinations were kept are not read again.
+        dataset: its bags. Those with an examination that was kept are not read again.
         curation: fitted on the reference. Scorers that learn from the dataset learn anew.
-        topic_map: how episodes are built; None: by the map in each bag.
+        topic_map: how episodes are built; None: by the map in each recording.
 
     Returns:
         The curation, fitted on the dataset, and the decisions in force that are new. Bags that
@@ -347,41 +338,48 @@ def decide_dataset(
 
 
 def _find(paths: Iterable[Path]) -> tuple[list[Path], list[Unreadable]]:
-    """Bags at paths, each once, and the paths without a bag."""
-    bags: dict[Path, Path] = {}
+    """Paths of the recordings, each once, and the paths without one."""
+    found: dict[Path, Path] = {}
     missing = []
     for path in paths:
         try:
-            for bag in find_episodes([path]):
-                bags.setdefault(bag.resolve(), bag)
+            for recording in find_episodes([path]):
+                found.setdefault(recording.resolve(), recording)
         except CurationError as err:
             missing.append(Unreadable(path, err))
-    return list(bags.values()), missing
+    return list(found.values()), missing
 
 
 def _decided(
-    curation: Curation, examiner: Examiner | _InMemory, bags: Sequence[Path], progress: Progress
+    curation: Curation,
+    examine: Callable[[], Iterable[Examined]],
+    tie: TieKey | None,
+    progress: Progress,
 ) -> Iterator[ScoringResult]:
     """Results before anything is logged.
 
-    A rule that needs the dataset is fitted on all examinations first. The second pass finds them
-    kept, unless there is no place to keep them.
+    Args:
+        curation: fitted on the dataset, if a scorer needs that.
+        examine: gives all examinations. It is called twice if the rule looks at the dataset, and
+            the second time most examinations have been kept.
+        tie: orders equal scores.
+        progress: wraps the longest loop.
     """
     rule: FittedRule | None = None
     known: dict[Path, bool] = {}
     if curation.rule_needs_dataset:
         scores: dict[str, float | None] = {}
         copies = Copies()
-        for one in progress(examiner.run(bags)):
+        for one in progress(examine()):
             known[one.path] = one.is_known
             if isinstance(one.result, Examination):
                 found = copies.note(one.result)
                 if found.is_trusted:
                     scores[found.episode] = found.scores.get(curation.settings.rule_scorer)
-        rule = curation.rule_over(scores, final=True, tie=_tie_of(bags))
-        results: Iterable[Examined] = examiner.run(bags)
+        rule = curation.rule_over(scores, final=True, tie=tie)
+        results = examine()
     else:
-        results = progress(examiner.run(bags))
+        results = progress(examine())
     copies = Copies()
     for one in results:
         if isinstance(one.result, Examination):
@@ -392,9 +390,9 @@ def _decided(
             yield Unreadable(one.path, one.result)
 
 
-def _tie_of(bags: Sequence[Path]) -> TieKey | None:
-    """The tie key of the dataset that all bags are in; None if there is no such dataset."""
-    homes = {home_of(bag)[0] for bag in bags}
+def _tie_of(paths: Sequence[Path]) -> TieKey | None:
+    """The tie key of the dataset that has all recordings; None if there is no such dataset."""
+    homes = {home_of(path)[0] for path in paths}
     if len(homes) != 1:
         return None
     [home] = homes
@@ -421,13 +419,13 @@ def _logged(scored: Scored, dataset: Dataset) -> Scored:
 
 
 class _People:
-    """What people have decided, in the datasets that bags are in; each is opened once."""
+    """Decisions of people, in the datasets of the recordings; each dataset is opened once."""
 
     def __init__(self) -> None:
         self._datasets: dict[Path, Dataset | None] = {}
 
     def decision_on(self, path: Path, episode_id: str) -> Decision | None:
-        """The decision in force on a bag of a dataset, if it is a person's."""
+        """The decision in force on a recording in a dataset, if it is a person's."""
         folder, _ = home_of(path)
         if folder not in self._datasets:
             self._datasets[folder] = Dataset(folder) if is_dataset(folder) else None

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.progress import track
 
 from curation_ros.batch.examine import Examined
-from curation_ros.batch.score import Scored, Scoring, ScoringResult, Unreadable, score_bags
+from curation_ros.batch.score import Scored, Scoring, ScoringResult, Unreadable, score_recordings
 from curation_ros.cli.arguments import add_config, add_reference, add_rule, add_workers
 from curation_ros.cli.output import console, print_json, progress_console, warn
 from curation_ros.cli.score_table import score_table
@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Score, print, and report what could not be scored."""
     topic_map = read_topic_map(args.topic_map) if args.topic_map else None
-    scoring = score_bags(
+    scoring = score_recordings(
         args.paths,
         _settings(args),
         read_reference(args.reference, topic_map) if args.reference else [],
@@ -96,7 +96,7 @@ def _settings(args: argparse.Namespace) -> CurationSettings:
 
 def _with_progress(scoring: Scoring) -> Iterator[ScoringResult]:
     """The results, with a bar on a terminal."""
-    n = len(scoring.bags)
+    n = len(scoring.paths)
 
     def bar(results: Iterable[Examined]) -> Iterable[Examined]:
         return track(
@@ -125,7 +125,7 @@ def _report(scoring: Scoring, is_json: bool) -> None:
         )
     if scoring.problem:
         warn(f"results could not be kept for the next run: {scoring.problem}")
-    if len(scoring.bags) >= _FEW and (progress_console.is_terminal or not is_json):
+    if len(scoring.paths) >= _FEW and (progress_console.is_terminal or not is_json):
         verdicts = [f"{counts.verdicts[v]} {v}" for v in VERDICTS if counts.verdicts[v]]
         totals = (
             f"{counts.n_scored} scored ({counts.n_known} cached), {counts.n_unreadable} unreadable"

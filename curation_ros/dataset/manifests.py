@@ -11,7 +11,7 @@ from curation_ros.bags import episode_of, open_bag
 from curation_ros.core.decision.balance import Balance, balance_of, phase_steps
 from curation_ros.core.decision.decision import Decision, own_decisions, untrustworthy
 from curation_ros.core.decision.manifest import Entry, Manifest
-from curation_ros.core.decision.rules import given_params, make_rule
+from curation_ros.core.decision.rules import Rule, given_params, make_rule
 from curation_ros.core.decision.selection import Candidate, check_selects, select
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.topic_map import TopicMap
@@ -51,53 +51,81 @@ def save_selection(
             and no scorer is named.
         CurationError: if there is no bag, the name is taken, or the rule has no basis.
     """
-    rule = rule or ("gap" if scorer else "decisions")
-    ruler = make_rule(rule, scorer, given_params(rule, value, method))
-    check_selects(ruler)
-    if scorer and not ruler.reads_scores:
-        raise ConfigError(f"rule {rule!r} reads no scores: --scorer {scorer} needs another --rule")
-    if ruler.reads_scores and not scorer:
-        raise ConfigError(f"rule {rule!r} reads the scores of a scorer: name one with --scorer")
-    bags = list(dataset.bags())
-    if not bags:
-        raise ConfigError(f"dataset {dataset.path}: no episode to select from")
-    decided = dataset.latest_decisions()
-    scored: dict[str, Decision] = {}
-    if ruler.reads_scores:
-        scored = own_decisions(d for bag in bags for d in dataset.decisions(bag.name))
-        _check_scored(dataset, scorer, scored)
-    names = dict(dataset.names())
-    candidates = [
-        _candidate(bag.name, names, scorer, decided.get(bag.name), scored.get(bag.name))
-        for bag in bags
-    ]
+    chooser = _chooser(rule or ("gap" if scorer else "decisions"), value, method, scorer)
+    candidates, state_hash = _candidates(dataset, chooser)
     resolution = find_scorer(scorer)().resolution if is_scorer(scorer) else 0.0
-    chosen = select(candidates, ruler, seed=seed, tie=dataset.tie(seed), resolution=resolution)
+    chosen = select(candidates, chooser, seed=seed, tie=dataset.tie(seed), resolution=resolution)
+    used = chooser.params().get(chooser.value_param) if chooser.value_param else None
     now = datetime.now(timezone.utc)
-    basis = scored if ruler.reads_scores else decided
-    hashes = {d.state_hash for d in basis.values()}
-    used = ruler.params().get(ruler.value_param) if ruler.value_param else None
     manifest = Manifest(
-        name=name or f"{rule}-{now:%Y%m%dT%H%M%S%f}",
+        name=name or f"{chooser.name}-{now:%Y%m%dT%H%M%S%f}",
         created_at=now.isoformat(timespec="seconds"),
         dataset=str(dataset.path),
         scorer=scorer,
-        rule=rule,
+        rule=chooser.name,
         entries=chosen.entries,
         kept_of=chosen.kept_of,
         rule_params={"value": used, "seed": seed, **({"method": method} if method else {})},
-        state_hash=",".join(sorted(hashes)),
+        state_hash=state_hash,
         abstained=chosen.abstained,
         phases=phases_of(dataset, chosen.entries),
     )
     return manifest, dataset.save_manifest(manifest)
 
 
+def _chooser(name: str, value: float | None, method: str, scorer: str) -> Rule:
+    """The rule, if it can select and fits the scorer.
+
+    Raises:
+        ConfigError: if not.
+    """
+    rule = make_rule(name, scorer, given_params(name, value, method))
+    check_selects(rule)
+    if scorer and not rule.reads_scores:
+        raise ConfigError(f"rule {name!r} reads no scores: --scorer {scorer} needs another --rule")
+    if rule.reads_scores and not scorer:
+        raise ConfigError(f"rule {name!r} reads the scores of a scorer: name one with --scorer")
+    return rule
+
+
+def _candidates(dataset: Dataset, rule: Rule) -> tuple[list[Candidate], str]:
+    """All episodes of a dataset, and the hashes of the states that they were decided with.
+
+    Scores are those of the curator's last decision, whatever a person decided.
+
+    Raises:
+        ConfigError: if there is no episode, or no logged decision asked the scorer.
+    """
+    bags = list(dataset.bags())
+    if not bags:
+        raise ConfigError(f"dataset {dataset.path}: no episode to select from")
+    decided = dataset.latest_decisions()
+    scored: dict[str, Decision] = {}
+    if rule.reads_scores:
+        scored = own_decisions(d for bag in bags for d in dataset.decisions(bag.name))
+        _check_scored(dataset, rule.scorer, scored)
+    names = dict(dataset.names())
+    candidates = []
+    for episode_id in (bag.name for bag in bags):
+        own = scored.get(episode_id)
+        candidates.append(
+            Candidate(
+                episode=episode_id,
+                name=names.get(episode_id, ""),
+                score=own.scores.get(rule.scorer) if own is not None else None,
+                decision=decided.get(episode_id),
+                is_trusted=own is None or not untrustworthy(own.findings),
+            )
+        )
+    basis = scored if rule.reads_scores else decided
+    return candidates, ",".join(sorted({d.state_hash for d in basis.values()}))
+
+
 def _check_scored(dataset: Dataset, scorer: str, scored: Mapping[str, Decision]) -> None:
     """Refuse a scorer that no logged decision asked.
 
     Raises:
-        ConfigError: with the command that logs them.
+        ConfigError: with the command that logs its scores.
     """
     if any(scorer in d.scores for d in scored.values()):
         return
@@ -106,22 +134,6 @@ def _check_scored(dataset: Dataset, scorer: str, scored: Mapping[str, Decision])
         f"dataset {dataset.path}: no episode has a logged score of {scorer!r}: run "
         f"curation score {dataset.path} --write --scorers {scorer}"
         + (" --reference DATASET" if is_fitted else "")
-    )
-
-
-def _candidate(
-    episode_id: str,
-    names: Mapping[str, str],
-    scorer: str,
-    decided: Decision | None,
-    scored: Decision | None,
-) -> Candidate:
-    return Candidate(
-        episode=episode_id,
-        name=names.get(episode_id, ""),
-        score=scored.scores.get(scorer) if scored is not None else None,
-        decision=decided,
-        is_trusted=scored is None or not untrustworthy(scored.findings),
     )
 
 

@@ -35,7 +35,7 @@ _REMEMBERED = 8
 
 @dataclass
 class _OpenEpisode:
-    """An episode whose gate is open; `checked_ns` is the stamp of its last check for alerts."""
+    """An episode with an open gate; `checked_ns` is the stamp of its last check for alerts."""
 
     builder: EpisodeBuilder
     event: EpisodeEvent
@@ -108,8 +108,10 @@ class LiveCurator:
         self._scores = _known_scores(dataset, curation) if curation.rule_needs_dataset else {}
         self._open: dict[str, _OpenEpisode] = {}
         self._ended: dict[str, Episode] = {}  # as built live, until their bags are compared
-        self._read: deque[str] = deque(maxlen=_REMEMBERED)  # ids whose bags were read
-        self._unread: set[str] = set()  # ids whose bags closed before their gates
+        self._read: deque[str] = deque(
+            maxlen=_REMEMBERED
+        )  # ids of episodes with a bag that was read
+        self._unread: set[str] = set()  # ids of bags that closed before their gates
         self._alerts: list[Alert] = []
 
     def event(self, event: EpisodeEvent, now_s: float) -> list[Decided]:
@@ -141,7 +143,7 @@ class LiveCurator:
         return self.tick(now_s) if window is not None and window.ended is not None else []
 
     def tick(self, now_s: float) -> list[Decided]:
-        """Decide on every episode whose gate has closed."""
+        """Decide on every episode with a gate that has closed."""
         decided = []
         for closed in self.gate.close_ready(now_s):
             decided.append(self._decide_live(closed))

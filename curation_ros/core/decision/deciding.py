@@ -7,6 +7,7 @@ from typing import Any
 from curation_ros.core.decision.decision import CURATOR, Decision, Verdict, untrustworthy
 from curation_ros.core.decision.examination import Examination
 from curation_ros.core.decision.fitted_rule import FittedRule
+from curation_ros.core.decision.rules import Rule
 from curation_ros.core.types import NS_PER_S, Span
 
 
@@ -30,37 +31,22 @@ def decide(
         revision: number of the decision.
         by: its author.
     """
-    rule = fitted_rule.rule
+    rule, scores = fitted_rule.rule, examination.scores
     facts: dict[str, Any] = {
         "basis": fitted_rule.basis,
         "fitted_on": dict(fitted_rule.fitted_on),
         "scoring": fitted_rule.scoring_hash,
         "content": examination.content,
     }
-    scores = examination.scores
     if rule is not None and rule.cut is not None and rule.decider(scores) == rule.scorer:
         facts["threshold"] = float(rule.cut)
     if untrustworthy(examination.findings):
-        verdict, reason, span = _on_a_faulty_recording(examination, fitted_rule)
+        verdict, reason, span = _on_a_faulty_recording(examination, rule)
     elif rule is None:
         verdict, reason, span = "review", fitted_rule.no_rule, examination.span
     else:
-        verdict, reason = rule.verdict(examination.case)
-        span = examination.span
-        decider = facts["decided_by"] = rule.decider(scores)
-        if verdict == "salvage":
-            verdict, span, more = _salvaged(examination, decider)
-            reason += more
-            if verdict == "salvage":
-                broke = examination.breaks[decider]
-                facts["salvage"] = {
-                    "scorer": decider,
-                    "broke_ns": broke.at_ns,
-                    "margin_s": broke.margin_s,
-                }
-        failed = [f for f in examination.findings if f.kind == "task"]
-        if verdict == "keep" and failed:
-            verdict, reason = "review", f"{failed[0].id}: {failed[0].message}; but {reason}"
+        verdict, reason, span, more = _by_rule(examination, rule)
+        facts |= more
     return Decision(
         episode=examination.episode,
         name=examination.name,
@@ -78,11 +64,11 @@ def decide(
 
 
 def _on_a_faulty_recording(
-    examination: Examination, fitted_rule: FittedRule
+    examination: Examination, rule: Rule | None
 ) -> tuple[Verdict, str, Span]:
     """Review; or salvage of the sound part, if the rule keeps it."""
     faults = untrustworthy(examination.findings)
-    part, rule = examination.part, fitted_rule.rule
+    part = examination.part
     if part is not None and rule is not None:
         verdict, text = rule.verdict(part.case(examination.episode))
         if verdict == "keep":
@@ -91,11 +77,25 @@ def _on_a_faulty_recording(
     return "review", f"{faults[0].id}: {faults[0].message}{more}", examination.span
 
 
-def _salvaged(examination: Examination, scorer: str) -> tuple[Verdict, Span, str]:
-    """Verdict, span and the end of the reason for an episode that a scorer saw break."""
-    broke = examination.breaks.get(scorer)
-    if broke is None:
-        return "discard", examination.span, ""
-    if broke.span is None:
-        return "discard", examination.span, "; too little was good before that"
-    return "salvage", broke.span, f"; kept until {broke.span[1] / NS_PER_S:.2f} s"
+def _by_rule(examination: Examination, rule: Rule) -> tuple[Verdict, str, Span, dict[str, Any]]:
+    """Verdict, reason, span and evidence, where the recording can be trusted."""
+    verdict, reason = rule.verdict(examination.case)
+    decider = rule.decider(examination.scores)
+    facts: dict[str, Any] = {"decided_by": decider}
+    if verdict == "salvage":
+        broke = examination.breaks.get(decider)
+        if broke is None:
+            return "discard", reason, examination.span, facts
+        if broke.span is None:
+            reason += "; too little was good before that"
+            return "discard", reason, examination.span, facts
+        facts["salvage"] = {
+            "scorer": decider,
+            "broke_ns": broke.at_ns,
+            "margin_s": broke.margin_s,
+        }
+        return verdict, f"{reason}; kept until {broke.span[1] / NS_PER_S:.2f} s", broke.span, facts
+    failed = [f for f in examination.findings if f.kind == "task"]
+    if verdict == "keep" and failed:
+        verdict, reason = "review", f"{failed[0].id}: {failed[0].message}; but {reason}"
+    return verdict, reason, examination.span, facts

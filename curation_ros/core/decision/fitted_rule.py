@@ -106,8 +106,8 @@ def fit_rule_over(
 
     Args:
         fitted: scorers that gave the scores.
-        scores: episode id -> the deciding scorer's score, of every episode of the dataset whose
-            recording has no fault, or of those scored so far; None where it abstained.
+        scores: episode id -> the deciding scorer's score, None where it abstained. Of every
+            episode of the dataset without a fault of its recording, or of those scored so far.
         final: whether the dataset is complete.
         tie: episode id -> key that orders equal scores.
     """

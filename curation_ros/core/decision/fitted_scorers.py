@@ -65,7 +65,7 @@ class Looks:
 class FittedScorers:
     """Scorers as they score: after `fit_scorers`, and after `fit_dataset` where needed.
 
-    Invariant: scores are functions of the episode and of a state whose hash is `scoring_hash`.
+    Invariant: scores are functions of the episode and of the state behind `scoring_hash`.
     Neither the order of the reference or the dataset, nor the number of scored episodes, changes
     them.
 

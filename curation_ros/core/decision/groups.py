@@ -17,7 +17,7 @@ METHODS: dict[str, str] = {
     "mixture": "two normal groups instead of one, by the Bayesian information criterion",
     "largest-gap": "a gap between neighbouring scores of twice the next largest",
 }
-#: Fewer scores than this say nothing about groups.
+#: Fewer scores than this are too few to find groups in.
 MIN_SCORES = 8
 # Kass and Raftery (1995) call 6 to 10 strong evidence, and more than 10 very strong.
 _MIN_BIC_GAIN = 10.0

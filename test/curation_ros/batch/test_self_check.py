@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from decided import decide_on
 from episodes import make_episode, make_reference
-from peeking import Peeker, bag_being_read
+from peeking import Peeker, path_being_read
 from streams import record
 
 from curation_ros.batch.self_check import IDENTITY, flipped, self_check
@@ -46,7 +46,7 @@ class Listener(Peeker):
 
     def look(self, episode: Episode) -> Look:
         """1.0 where the last line of the log is a keep."""
-        log = Dataset(bag_being_read().resolve().parents[1]).decisions(episode.id)
+        log = Dataset(path_being_read().resolve().parents[1]).decisions(episode.id)
         return Look(float(log[-1].verdict == "keep"))
 
 
@@ -55,7 +55,7 @@ class Resolver(Peeker):
 
     def look(self, episode: Episode) -> Look:
         """As its parent, from where the bag's own file really is."""
-        [file] = bag_being_read().glob("*.mcap")
+        [file] = path_being_read().glob("*.mcap")
         truth = Dataset(file.resolve().parents[2]).truth()
         return Look(float(truth.get(episode.id, {}).get("outcome") == "succeeded"))
 

@@ -56,7 +56,7 @@ def make_rule(name: str, scorer: str, params: Mapping[str, Any] | None = None) -
 
 
 def given_params(name: str, value: float | None = None, method: str = "") -> dict[str, Any]:
-    """Hyper-parameters of a rule from what `--value` and `--method` say.
+    """Hyper-parameters of a rule from `--value` and `--method`.
 
     Args:
         name: one of RULES.

@@ -22,7 +22,7 @@ class _Best(Rule):
     """Keeps a number of episodes, the best of the dataset, and discards the rest.
 
     Of equal scores at the cut some are kept by lot, that is by their tie keys, so that the number
-    comes out. The reason says so.
+    comes out. Their reasons name the lot.
 
     Attributes:
         cut_: lowest score that is kept; infinite if nothing is kept.
@@ -83,7 +83,9 @@ class _Best(Rule):
         if isinstance(score, str):
             return "review", score
         if not hasattr(self, "cut_"):
-            raise NotFittedError(f"rule {self.name!r} has seen no dataset: fit it first")
+            raise NotFittedError(
+                f"rule {self.name!r} was not fitted on a dataset: call fit_dataset first"
+            )
         by_lot = score == self.cut_ and bool(self.by_lot_)
         keep = case.episode in self.by_lot_ if by_lot else score >= self.cut_
         shown, limit = told_apart(score, self.cut_)

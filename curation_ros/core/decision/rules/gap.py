@@ -22,7 +22,7 @@ class Gap(Rule):
 
     If the scores do not separate, or an episode lies between the groups, a person is asked: it
     never falls back to a fixed share. It assumes that the upper group is the good one. That is
-    wrong for a scorer whose sign depends on the majority, and no rule can detect it.
+    wrong for a scorer that follows the majority, and no rule can detect it.
 
     Attributes:
         cut_: where the groups part; None where there is one group.
@@ -75,7 +75,7 @@ class Gap(Rule):
         if isinstance(score, str):
             return "review", score
         if not hasattr(self, "cut_"):
-            raise NotFittedError("rule 'gap' has seen no dataset: fit it first")
+            raise NotFittedError("rule 'gap' was not fitted on a dataset: call fit_dataset first")
         if self.cut_ is None:
             return "review", self.no_basis
         shown, limit = told_apart(score, self.cut_)

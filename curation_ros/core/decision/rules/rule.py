@@ -27,7 +27,7 @@ class Case:
         episode: its id. A rule that keeps a number of episodes draws lots by it at the cut.
         scores: scorer -> score, None where it abstained.
         abstained: scorer -> why.
-        explanations: scorer -> what can be seen in the episode, where a scorer says it.
+        explanations: scorer -> one sentence for the operator, where it has one.
         decision: the decision in force, where one was made before.
     """
 
@@ -153,7 +153,7 @@ class Rule(ABC):
         """
 
     def decider(self, scores: Mapping[str, float | None]) -> str:
-        """The scorer whose score of an episode decides."""
+        """The scorer that decides on an episode with these scores."""
         return self.scorer
 
     def params(self) -> dict[str, Any]:
