@@ -1,4 +1,4 @@
-"""The simulated robot: LIBERO's task, its scripted expert, and the defects that are injected.
+"""The simulated robot: environments, tasks with their experts, and injected defects.
 
-Everything but `node` is plain Python and imports no ROS.
+Only `node` imports ROS.
 """

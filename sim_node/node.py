@@ -1,4 +1,4 @@
-"""Sim node: LIBERO on the graph, in lockstep or free, driven by its expert or by commands."""
+"""Sim node: a simulated task on the graph, in lockstep or free, by its expert or by commands."""
 
 from __future__ import annotations
 
@@ -39,35 +39,52 @@ from sim_node.defects import DEFECTS
 from sim_node.driving import Commands, DrivenEpisode, Driver
 from sim_node.messages import CLOCK_TOPIC, COMMAND_TOPICS, COMMAND_TYPES, RobotMessages
 from sim_node.planning import EpisodePlan, plan_episodes
-from sim_node.settings import (
-    MAX_STEPS,
-    SIMULATED_TASK,
-    STEPS_AFTER_SUCCESS,
-    DriveSettings,
-)
+from sim_node.settings import SIMULATED_TASK, DriveSettings
 from sim_node.tasks import TASKS, start_names
 
+_DEFAULT = DriveSettings()
+
 PARAMETERS = (
-    Parameter("mode", "expert", "who drives", choices=("expert", "command")),
-    Parameter("sync", "lockstep", "when to step", choices=("lockstep", "free")),
+    Parameter("mode", _DEFAULT.mode, "who gives the commands", choices=("expert", "command")),
+    Parameter("sync", _DEFAULT.sync, "when the robot steps", choices=("lockstep", "free")),
     Parameter("simulated_task", SIMULATED_TASK, "what is simulated", choices=tuple(TASKS)),
-    Parameter("episodes", 1, "how many; 0: on and on, owned by somebody else", 0, 100_000),
+    Parameter("episodes", 1, "how many; 0: no end, and another node owns episodes", 0, 100_000),
     Parameter("task", "bowl", "short names are <task>-<number>"),
     Parameter("first_number", 1, "number of the first episode", 0, 1_000_000),
-    Parameter("seed", 0, "of order, expert and defects", 0, 2**31 - 1),
+    Parameter("seed", 0, "seed of order, expert and defects", 0, 2**31 - 1),
     Parameter("contamination", 0.0, "fraction of defective demonstrations", 0.0, 1.0),
-    Parameter("defect", "early_release", "what is wrong with those", choices=tuple(DEFECTS)),
-    Parameter("paired", False, "defective demonstrations recur on the starts of clean ones"),
+    Parameter("defect", "early_release", "kind of the defect", choices=tuple(DEFECTS)),
+    Parameter("paired", False, "whether defective demonstrations reuse the starts of clean ones"),
     Parameter("starts", "", "official:0:50 or generated:SEED:COUNT; empty: generated, by seed"),
-    Parameter("max_steps", MAX_STEPS, "steps after which an episode ends", 1, 100_000),
-    Parameter("max_steps_defective", 0, "the same where a defect is in; 0: max_steps", 0, 100_000),
-    Parameter("steps_after_success", STEPS_AFTER_SUCCESS, "steps recorded after success", 0, 1000),
-    Parameter("dataset", "", "its truth.jsonl gets the outcomes; empty: they are not written"),
-    Parameter("realtime_factor", 1.0, "speed when free", 0.01, 100.0),
-    Parameter("hold_timeout_s", 0.5, "free: an older command becomes zero, s", 0.0, 60.0),
-    Parameter("command_timeout_s", 5.0, "lockstep: patience for a command, s", 0.1, 3600.0),
-    Parameter("wait_for", (), "nodes to wait for before the first reset; recorder: also for bags"),
-    Parameter("lean", True, "our own stepping; false: LIBERO's env.step"),
+    Parameter("max_steps", _DEFAULT.max_steps, "most commands of an episode", 1, 100_000),
+    Parameter(
+        "max_steps_defective",
+        _DEFAULT.max_steps_defective,
+        "the same for defective episodes; 0: max_steps",
+        0,
+        100_000,
+    ),
+    Parameter(
+        "steps_after_success", _DEFAULT.steps_after_success, "commands after success", 0, 1000
+    ),
+    Parameter("dataset", "", "where outcomes are written, to truth.jsonl; empty: nowhere"),
+    Parameter(
+        "realtime_factor", _DEFAULT.realtime_factor, "free: speed, 1 is real time", 0.01, 100.0
+    ),
+    Parameter(
+        "hold_timeout_s", _DEFAULT.hold_timeout_s, "free: older commands become zero, s", 0.0, 60.0
+    ),
+    Parameter(
+        "command_timeout_s",
+        _DEFAULT.command_timeout_s,
+        "lockstep: longest wait for a command, s",
+        0.1,
+        3600.0,
+    ),
+    Parameter(
+        "wait_for", (), "nodes that must run before the first reset; recorder: also for its bags"
+    ),
+    Parameter("lean", True, "fast stepping; false: the benchmark's own, LIBERO's env.step"),
 )
 _REPORT_S = 5.0
 
@@ -143,7 +160,7 @@ def several_commanders(node: Node) -> str:
 
 
 class SimNode(WorkingNode):
-    """Owns the episodes: says where each starts and ends, and what was executed in between."""
+    """Owns the episodes: it reports where each starts and ends, and how many steps it has."""
 
     def __init__(self) -> None:
         super().__init__("sim_node")
@@ -158,7 +175,7 @@ class SimNode(WorkingNode):
             self._plans = plan_episodes(
                 n, p["contamination"], p["defect"], p["seed"], names, paired=p["paired"]
             )
-        else:  # nothing to inject into somebody else's commands: the starts in their order
+        else:  # the commands come from another node: no defects, and the starts in their order
             k = len(names)
             self._plans = [EpisodePlan(i, names[i % k], i // k, "none", 0, 0) for i in range(n)]
         dataset = Path(p["dataset"]).expanduser()
@@ -204,7 +221,7 @@ class SimNode(WorkingNode):
     # --- the script -------------------------------------------------------------------------
 
     def work(self) -> bool:
-        """Go on with the script; raises Finished after the last episode."""
+        """Resume the script; raises Finished after the last episode."""
         now_s = time.monotonic()
         if self._health.due(now_s):
             two = self._p["episodes"] > 0 and self.count_publishers("episode") > 1
@@ -218,13 +235,13 @@ class SimNode(WorkingNode):
             raise Finished from None
 
     def close(self) -> None:
-        """Give up the running episode, and see that everybody hears how it ended."""
+        """Abort the running episode, and wait until every subscriber has its end."""
         self._script.close()
         self._out.flush()
         self._env.close()
 
     def _play(self) -> Generator[bool, None, None]:
-        """All episodes; a generator that yields to the executor, True to go on at once."""
+        """All episodes; yields to the executor, and yields True to be resumed at once."""
         yield from self._until_none(
             lambda: [n for n in self._p["wait_for"] if not self._out.is_matched(n)]
         )
@@ -242,11 +259,11 @@ class SimNode(WorkingNode):
                 return
 
     def wait_for_recorder(self, episode_id: str) -> Iterator[bool]:
-        """Wait until the recorder, if it is one to wait for, records an episode."""
+        """Wait until the recorder records an episode, if `wait_for` names it."""
         return self._until_recorder(episode_id, "recording", "closed", "failed")
 
     def unconfirmed(self, episode_id: str) -> str:
-        """The recorder and our topics of which it has nothing yet in an episode, or empty."""
+        """The recorder and those of our topics that it lacks in an episode, or empty."""
         status = self._recorder.get(episode_id)
         if not self._is_recorded or status is None or not status.message.startswith("recording"):
             return ""
@@ -273,7 +290,7 @@ class SimNode(WorkingNode):
             yield from self._until_none(missing)
 
     def _until_none(self, missing: Callable[[], list[str]]) -> Iterator[bool]:
-        """Wait until nobody is missing, with a line in the log every few seconds."""
+        """Wait until no node is missing, with a line in the log every few seconds."""
         reported_s = time.monotonic()
         while names := missing():
             if time.monotonic() - reported_s > _REPORT_S:

@@ -1,13 +1,13 @@
 """One control step of robosuite's OSC_POSE controller and MuJoCo, compiled to machine code.
 
-robosuite runs MuJoCo's whole pipeline two or three times for each 2 ms of simulated time and
-computes the controller in Python. Here the pipeline runs once, split where the controller
-belongs (`mj_step1`, torques, `mj_step2`), and the controller is compiled by Numba, which calls
-MuJoCo's C functions by their names. The arithmetic is robosuite 1.4's, except that 3x3, 6x6 and
-7x7 systems are solved by Cholesky factors where it forms (pseudo-)inverses; both agree to
-rounding, which a test checks against the stock path.
+robosuite runs MuJoCo's whole pipeline two or three times per 2 ms of simulated time, and computes
+the controller in Python. Here the pipeline runs once: `mj_step1`, torques, `mj_step2`. Numba
+compiles the controller, which calls MuJoCo's C functions by their names. The arithmetic is that of
+robosuite 1.4, with one exception: 3x3, 6x6 and 7x7 systems are solved by Cholesky factors instead
+of (pseudo-)inverses. Both agree to rounding, which a test checks against the stock path.
 
-Importing this module compiles (the first time, seconds) or loads (from then on) the machine code.
+The first import of this module compiles the machine code, which takes seconds. Later imports load
+it.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ N_ARM = 7
 """Joints of the arm; they are the first ones of the model."""
 
 GRIPPER_SPEED_PER_SUBSTEP = 0.01
-"""How fast a gripper command moves the normalised finger target, as robosuite's PandaGripper."""
+"""Speed of the normalised finger target, as in robosuite's PandaGripper."""
 
 NULLSPACE_KP = 10.0
 NULLSPACE_KV = 2.0 * 10.0**0.5
-"""Stiffness and critical damping towards the nominal posture, as robosuite's nullspace_torques."""
+"""Stiffness and critical damping to the nominal posture, as in robosuite's nullspace_torques."""
 
 
 def _link_mujoco() -> None:
-    """Make the C functions of the MuJoCo that Python uses known to Numba's linker."""
+    """Link the C functions of Python's MuJoCo for Numba."""
     folder = Path(mujoco.__file__).parent
     for pattern in ("libmujoco.so*", "libmujoco*.dylib", "mujoco.dll"):
         for library in sorted(folder.glob(pattern)):
@@ -48,8 +48,8 @@ def _link_mujoco() -> None:
 
 
 def _compiled(signature: str) -> Callable[[Callable[..., Any]], Any]:
-    """Numba's njit with a cache on disk where there is a place for one."""
-    # A division by zero gives a NaN that the check for divergence finds, as everywhere in MuJoCo.
+    """Numba's njit with a cache on disk, if there is a place for one."""
+    # A division by zero gives a NaN, as elsewhere in MuJoCo; the check for divergence finds it.
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -65,14 +65,14 @@ def _compiled(signature: str) -> Callable[[Callable[..., Any]], Any]:
 
 _link_mujoco()
 _ADDRESS = types.intp
-# By name, not by address: an address in the machine code would forbid to cache it.
+# By name: machine code with addresses cannot be cached.
 _mj_step1: Any = types.ExternalFunction("mj_step1", types.void(_ADDRESS, _ADDRESS))
 _mj_step2: Any = types.ExternalFunction("mj_step2", types.void(_ADDRESS, _ADDRESS))
 _mj_kinematics: Any = types.ExternalFunction("mj_kinematics", types.void(_ADDRESS, _ADDRESS))
 _mj_jac_site: Any = types.ExternalFunction(
     "mj_jacSite", types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, types.int32)
 )
-# Not mj_fullM, whose arguments differ between versions. Products with unit vectors do not.
+# Not mj_fullM, because its arguments differ between versions of MuJoCo.
 _mj_mul_m: Any = types.ExternalFunction(
     "mj_mulM", types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS)
 )
@@ -82,8 +82,7 @@ _mj_mul_m: Any = types.ExternalFunction(
 def _factor(a, n):  # type: ignore[no-untyped-def]
     """Replace the lower triangle of the symmetric (n, n) block by its Cholesky factor.
 
-    A matrix that is not positive definite gives NaN, which the caller's check for divergence
-    finds.
+    A matrix that is not positive definite gives NaN, and the check for divergence finds it.
     """
     for j in range(n):
         for k in range(j):
@@ -138,7 +137,7 @@ def control_step(  # type: ignore[no-untyped-def]
     Args:
         model: address of the mjModel.
         data: address of the mjData.
-        n_substeps: MuJoCo steps a control step.
+        n_substeps: MuJoCo steps per control step.
         site_id: of the grip site.
         qpos: (nq,) view of the mjData, arm first, then the two fingers.
         qvel: (nv,) view of the mjData, in the same order.
@@ -148,7 +147,7 @@ def control_step(  # type: ignore[no-untyped-def]
         site_rotation: (9,) view of the grip site's rotation matrix in the mjData.
         delta_position_m: (3,) goal relative to the position at the start of the step.
         goal_rotation: (3, 3) rotation to hold.
-        nominal_joint_position_rad: (7,) posture that the null space is drawn to.
+        nominal_joint_position_rad: (7,) posture to which the null space is drawn.
         kp: stiffness, 1/s^2.
         kd: damping, 1/s.
         ctrl_range: (nu, 2) limits: torques of the arm, positions of the fingers.
@@ -215,7 +214,7 @@ def control_step(  # type: ignore[no-untyped-def]
                 position_factor[i, j] = inverse_lambda[i, j]
                 rotation_factor[i, j] = inverse_lambda[3 + i, 3 + j]
 
-        # Half the sum of the cross products of the axes: the rotation that is still to do.
+        # Half the sum of the cross products of the axes is the remaining rotation.
         for i in range(3):
             force[i] = kp * (goal_position[i] - site_position[i]) - kd * velocity[i]
             torque[i] = -kd * velocity[3 + i]
@@ -234,7 +233,7 @@ def control_step(  # type: ignore[no-untyped-def]
         _factor(rotation_factor, 3)
         _solve(rotation_factor, 3, torque)
 
-        # What draws to the nominal posture, less what of it would move the hand.
+        # Torques to the nominal posture, minus the part that would move the hand.
         for i in range(7):
             total = 0.0
             for j in range(7):
@@ -269,5 +268,5 @@ def control_step(  # type: ignore[no-untyped-def]
             ctrl[7 + finger] = 0.5 * (high + low) + 0.5 * (high - low) * target
         _mj_step2(model, data)
 
-    # After mj_step2 the poses are still those before the last substep.
+    # mj_step2 leaves the poses as they were before the last substep.
     _mj_kinematics(model, data)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from curation_ros.core.evidence.holds import CARRY_PHASES
 from sim_node.environment import Observation
 from sim_node.libero.problem import LiberoProblem
 from sim_node.libero.starts import N_OFFICIAL, LiberoStarts, Place
 from sim_node.starts import Start
 from sim_node.tasks.pick_and_place import (
-    CARRY_PHASES,
     PHASES,
     Geometry,
     PickAndPlaceExpert,

@@ -16,7 +16,6 @@ from sim_node.environment import GRIPPER_CLOSE, GRIPPER_OPEN, Observation
 from sim_node.tasks.task import Step
 
 PHASES = ("PREGRASP", "DESCEND", "GRASP", "LIFT", "TRANSPORT", "RELEASE")
-CARRY_PHASES = ("LIFT", "TRANSPORT")
 PREGRASP, DESCEND, GRASP, LIFT, TRANSPORT, RELEASE = range(len(PHASES))
 
 _UP = np.array([0.0, 0.0, 1.0])

@@ -1,4 +1,4 @@
-"""A node that commands the sim node as a test wants it to."""
+"""A node that sends commands to the sim node."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ COMMANDS = ("command/twist", "command/gripper")
 
 
 class Commander:
-    """Says what it is told to, as an answer to an observation."""
+    """Answers observations with the commands that a test chooses."""
 
     def __init__(self, graph, name="commander"):
         self.node = Node(name, context=graph.context, enable_rosout=False)
@@ -20,7 +20,7 @@ class Commander:
     def close(self):
         self.node.destroy_node()
 
-    def say(self, message, z=0.0, *, twist=True, gripper="gripper"):
+    def send(self, message, z=0.0, *, twist=True, gripper="gripper"):
         """Answer one observation."""
         if twist:
             command = TwistStamped(header=message.header)

@@ -246,13 +246,13 @@ def test_demonstrations_of_a_new_task_are_collected(toy, tmp_path):
     for bag in dataset.bags():
         episode = read_episode(bag)
         assert episode.findings == ()
-        told = truth[episode.name]
-        is_clean = told["defect"] == "none"
-        assert told["outcome"] == ("succeeded" if is_clean else "failed")
+        line = truth[episode.name]
+        is_clean = line["defect"] == "none"
+        assert line["outcome"] == ("succeeded" if is_clean else "failed")
         away_m = episode.field("cup")[-1] - episode.field("coaster")[0]
         assert (np.linalg.norm(away_m) < 0.03) == is_clean
         if not is_clean:
-            release = told["release_step"]
+            release = line["release_step"]
             assert episode.phase_labels[int(episode.phase[release])] == "CARRY"
             assert set(episode.field("grip")[release:, 0]) == {-1.0}
 

@@ -1,4 +1,4 @@
-"""The sim node with its expert: whole episodes, and labels that travel apart from the data."""
+"""The sim node with its expert: complete episodes, and labels apart from the data."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_expert_episodes_are_recorded_whole(graph, expert):
     for event in ends:
         episode = read_episode(expert / "episodes" / event.id)
         assert episode.findings == ()
-        # The end is the last observation whose command was executed; counts are distinct stamps.
+        # An episode ends with the last executed command; counts are distinct stamps.
         n = len(episode)
         assert event.end_ns == event.start_ns + (n - 1) * PERIOD_NS
         assert episode.stamps_ns.tolist() == list(
@@ -59,7 +59,7 @@ def test_expert_episodes_are_recorded_whole(graph, expert):
         bag = open_bag(expert / "episodes" / event.id)
         assert set(event.counts) >= {*OBSERVATIONS, *COMMANDS}
         assert set(event.counts.values()) == {n}
-        # Where the recorder was slow to discover us, the first step is there twice.
+        # The first step may be there twice, if discovery by the recorder took time.
         assert all(topic.count >= n for topic in bag.topics.values())
         recorded = json.loads(bag.custom_data["recording"])["topics"]
         assert {stats["count"] for stats in recorded.values()} == {n}
@@ -79,8 +79,8 @@ def test_outcome_and_truth_travel_apart_from_the_data(graph, expert):
         wanted = "failed" if line["defect"] == "early_release" else "succeeded"
         assert line["outcome"] == wanted
         graph.until(lambda i=episode_id: i in [s.hardware_id for s in graph.outcomes], "outcome")
-        said = [s.message for s in graph.outcomes if s.hardware_id == episode_id]
-        assert said == [wanted]
+        published = [s.message for s in graph.outcomes if s.hardware_id == episode_id]
+        assert published == [wanted]
         bag = open_bag(expert / "episodes" / episode_id)
         assert not [t for t in bag.topics if "outcome" in t or t in ("/episode", "/clock")]
         files = b"".join(p.read_bytes() for p in bag.path.iterdir())
@@ -96,7 +96,7 @@ WRONG = {
 
 @pytest.fixture(scope="module")
 def refused(graph):
-    """Parameter -> (exit code, output) of nodes that were given a wrong value of it."""
+    """Parameter -> (exit code, output) of a node with a wrong value of it."""
     for name, (value, _) in WRONG.items():
         graph.start("sim_node", f"wrong_{name}", **{name: value})
     return {name: graph.expect_exit(f"wrong_{name}") for name in WRONG}

@@ -1,4 +1,4 @@
-"""The sim node that runs freely, owned by nobody, with a person at the commands."""
+"""The sim node in free mode: it owns no episodes, and a person gives commands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytest.importorskip("libero", reason="LIBERO is not installed")
 
 @pytest.fixture(scope="module")
 def free(graph):
-    """Nobody's episodes, on and on at five times real time, and a recorder driven by hand."""
+    """A sim node without end at five times real time, and a recorder operated by hand."""
     dataset = graph.folder / "free"
     graph.start(
         "sim_node",
@@ -39,7 +39,7 @@ def free(graph):
         {"__node": "free_recorder"},
         dataset=dataset,
         auto=False,
-        drain_timeout_s=1.0,  # commands fall silent
+        drain_timeout_s=1.0,  # commands stop arriving
     )
     seen = []
     graph.node.create_subscription(PoseStamped, "eef_pose", seen.append, MAPPED)
@@ -56,8 +56,10 @@ def by_hand(graph, service):
         return graph.call(Trigger, f"free_recorder/{service}", Trigger.Request())
 
     answer = press()
-    if answer.message.startswith("nothing has arrived"):  # it does not know the sim yet
-        answer = graph.until(lambda: (a := press()).success and a, "the recorder hears the sim")
+    if answer.message.startswith("nothing has arrived"):  # it has not discovered the sim yet
+        answer = graph.until(
+            lambda: (a := press()).success and a, "the recorder receives from the sim"
+        )
     assert answer.success, answer.message
     return answer
 
@@ -71,8 +73,8 @@ def test_free_command_is_held_and_then_zeroed(graph, free):
     graph.until(lambda: stamp_ns(seen[-1]) > started.start_ns, "an observation of the episode")
 
     def rises_and_rests():
-        """From a command on: it is held, then zeroed, and the arm comes to rest."""
-        commander.say(seen[-1], z=1.0)
+        """A command is held, then zeroed, and the arm comes to rest."""
+        commander.send(seen[-1], z=1.0)
         first = len(seen) - 1
 
         def rested():
@@ -82,19 +84,19 @@ def test_free_command_is_held_and_then_zeroed(graph, free):
         graph.until(rested, "the arm has risen and rests")
 
     rises_and_rests()
-    rises_and_rests()  # nothing but the zero had stopped it
+    rises_and_rests()  # only the zero command had stopped it
     by_hand(graph, "stop")
     graph.recorded(episode_id)
     bag = open_bag(dataset / "episodes" / episode_id)
     assert bag.topics[f"/{COMMANDS[0]}"].count == 2
 
 
-def test_sim_that_owns_no_episode_does_not_say_so(graph, free):
+def test_sim_without_episodes_of_its_own_publishes_none(graph, free):
     owners = graph.node.get_publishers_info_by_topic("episode")
     assert [info.node_name for info in owners] == ["free_recorder"]
 
 
-def test_reset_inside_an_episode_of_somebody_else(graph, free):
+def test_reset_inside_an_episode_of_another_owner(graph, free):
     dataset, _, seen = free
     episode_id = json.loads(by_hand(graph, "start").message)["episode"]
     graph.call(Trigger, "sim_node/reset", Trigger.Request())

@@ -1,4 +1,4 @@
-"""The sim node in lockstep with a commander that does what it should not, too."""
+"""The sim node in lockstep, with a commander that also makes mistakes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAX_STEPS = 12
 
 @pytest.fixture(scope="module")
 def lockstep(graph):
-    """A sim node that waits for commands; tests answer it, one episode after the other."""
+    """A sim node that waits for commands; each test answers one episode."""
     dataset = graph.folder / "lockstep"
     graph.start("recorder", "lockstep_recorder", dataset=dataset)
     graph.start(
@@ -44,7 +44,7 @@ def lockstep(graph):
     commander = Commander(graph)
     seen = []
     commander.node.create_subscription(PoseStamped, "eef_pose", seen.append, MAPPED)
-    # Who is waited for listens to the episodes, too.
+    # A node in `wait_for` must subscribe to the episodes.
     commander.node.create_subscription(DiagnosticArray, "episode", lambda _: None, LATCHED)
     graph._executor.add_node(commander.node)
     graph.until(
@@ -55,7 +55,7 @@ def lockstep(graph):
             )
             == 2
         ),
-        "sim and recorder hear the commander",
+        "sim and recorder have discovered the commander",
     )
     yield Lockstep(graph, dataset, commander, seen)
     graph._executor.remove_node(commander.node)
@@ -76,7 +76,7 @@ class Lockstep:
         self.n = 0
 
     def observation(self):
-        """The next observation; one that comes again was not answered in time: it is again."""
+        """The next observation; a repeated one was not answered in time, and is again."""
         while True:
             self.graph.until(lambda: self.seen, "an observation")
             found = self.seen.pop(0)
@@ -84,14 +84,14 @@ class Lockstep:
                 self.last_ns = stamp_ns(found)
                 return found
             if self.how is not None and stamp_ns(found) == self.last_ns:
-                self.commander.say(found, **self.how)
+                self.commander.send(found, **self.how)
 
     def answer(self, steps, **how):
-        """Answer so many observations."""
+        """Answer this many observations."""
         for _ in range(steps):
             found = self.observation()
             self.how = how
-            self.commander.say(found, **how)
+            self.commander.send(found, **how)
 
     def answer_slowly(self, pause_s):
         """Answer the newest observation after a pause, until the episode has ended."""
@@ -100,7 +100,7 @@ class Lockstep:
                 found = self.seen[-1]
                 self.seen.clear()
                 self.graph.quiet(pause_s)
-                self.commander.say(found)
+                self.commander.send(found)
             self.graph.spin()
 
     def _ends(self):
@@ -123,14 +123,14 @@ def test_late_answer_is_asked_for_again(graph, lockstep):
     graph.until(lambda: lockstep.seen, "the same observation, after half a second")
     again = lockstep.seen.pop()
     assert (again.header, again.pose) == (first.header, first.pose)
-    lockstep.commander.say(again)
-    lockstep.commander.say(again)
+    lockstep.commander.send(again)
+    lockstep.commander.send(again)
     lockstep.answer(MAX_STEPS - 5)
     event, episode = lockstep.end()
     assert (event.event, len(episode)) == ("ended", MAX_STEPS)
     assert set(event.counts.values()) == {MAX_STEPS}
     assert episode.findings == ()
-    # The bag may hold what was sent twice; the episode has one sample a stamp.
+    # The bag may contain repeated messages; the episode has one sample per stamp.
     assert np.unique(np.diff(episode.stamps_ns)).tolist() == [PERIOD_NS]
 
 
@@ -147,7 +147,7 @@ def test_command_that_never_comes_aborts_the_episode(graph, lockstep):
     assert truth["aborted"] == event.reason[9:]
 
 
-def test_half_a_command_is_none(graph, lockstep):
+def test_half_a_command_does_not_count(graph, lockstep):
     lockstep.answer(1)
     lockstep.answer(1, gripper="")
     event, episode = lockstep.end()
@@ -169,14 +169,14 @@ def test_second_commander_aborts_in_mid_episode(graph, lockstep):
     lockstep.answer_slowly(1.1)
     event, _ = lockstep.end()
     rival.close()
-    graph.counts_publishers("sim_node", COMMANDS, 1)  # the next episode is not to see it
+    graph.counts_publishers("sim_node", COMMANDS, 1)  # gone before the next episode
     # One of them may not have been discovered yet.
     said = r"aborted: commands come from commander and rival \([34] publishers\): stop all but one"
     assert re.fullmatch(said, event.reason)
 
 
 def test_publisher_that_has_no_name_yet_is_no_second_commander():
-    """The graph shows a publisher a moment before it shows whose it is."""
+    """The graph shows a publisher a moment before the name of its node."""
 
     def commanders(*names):
         seen = [SimpleNamespace(node_namespace="/", node_name=name) for name in names]

@@ -26,7 +26,7 @@ pytest.importorskip("libero", reason="LIBERO is not installed")
 
 from curation_ros.study.collect import Collection, collect  # noqa: E402 - needs LIBERO
 
-#: Short episodes: they are told as failed, and are whole all the same.
+#: Short episodes: their outcome is `failed`, but their bags are complete.
 SHORT = Collection(episodes=4, contamination=0.5, seed=3, paired=True, max_steps=20)
 
 
@@ -63,7 +63,7 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def data(collected: Path, tmp_path: Path) -> Path:
-    """A copy, to spoil."""
+    """A copy that a test may change."""
     shutil.copytree(collected, tmp_path / "data")
     return tmp_path / "data"
 
@@ -105,7 +105,7 @@ def test_episodes_equal_those_recorded_on_the_graph(tmp_path: Path) -> None:
 
 
 def forms(bag: Any) -> dict[str, Any]:
-    """What a bag says of itself, without ids and stamps."""
+    """Custom data of a bag, without ids and stamps."""
     data = {key: text for key, text in bag.custom_data.items()}
     event = json.loads(data.pop("episode"))
     for key in ("id", "start_stamp", "end_stamp"):

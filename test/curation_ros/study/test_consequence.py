@@ -51,7 +51,7 @@ class MissedGrasp(NoDefect):
 
 @pytest.fixture(scope="module")
 def episodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[Episode]]]:
-    """Demonstrations by what is wrong with them, two of each."""
+    """Defect -> two demonstrations with it."""
     patch = pytest.MonkeyPatch()
     patch.setitem(DEFECTS, "late_drop", Defect("late_drop", "", LateDrop))
     patch.setitem(DEFECTS, "missed_grasp", Defect("missed_grasp", "", MissedGrasp))

@@ -18,10 +18,10 @@ pytest.importorskip("mujoco")  # `libero` would find the folder of this test
 
 from sim_node.libero.env import LiberoEnv  # noqa: E402 - needs LIBERO
 
-# The two paths differ by rounding (Cholesky factors against inverses), amplified by contacts.
+# The two paths differ by rounding (Cholesky factors or inverses), amplified by contacts.
 STATE_TOLERANCE = 1e-11
-# From the grasp on rounding grows through sliding contacts (1e-5 m was measured), and may move the
-# end of a phase by a step.
+# After the grasp, sliding contacts amplify rounding (1e-5 m was measured), which may move the end
+# of a phase by a step.
 EPISODE_TOLERANCE = 1e-3
 EPISODE_TOLERANCE_STEPS = 2
 
@@ -81,7 +81,7 @@ def test_lean_equals_stock_for_an_expert_episode(env, stock):
     assert results[1].is_success
     n = min(result.n_steps for result in results)
     assert max(result.n_steps for result in results) <= n + EPISODE_TOLERANCE_STEPS
-    # Position and orientation of the effector up to the release, where the bowl begins to roll.
+    # Position and orientation of the effector until the release; then the bowl begins to roll.
     n -= STEPS_AFTER_SUCCESS
     lean, stock_rows = np.array(seen[True][:n]), np.array(seen[False][:n])
     np.testing.assert_allclose(lean[:, :7], stock_rows[:, :7], rtol=0, atol=EPISODE_TOLERANCE)
@@ -99,7 +99,7 @@ def test_reset_is_reproducible_to_the_bit(env):
     state = TASK.start("generated-0-003").state
     commands = random_commands(9, 30)
     first = rollout_states(env, state, commands)
-    # What ran in between must leave no trace: controller, gripper, warm start.
+    # Other episodes must leave no trace in controller, gripper and warm start.
     rollout_states(env, TASK.start("official-02").state, random_commands(10, 25))
     assert np.array_equal(first, rollout_states(env, state, commands))
     other = TASK.environment()

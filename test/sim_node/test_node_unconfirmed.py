@@ -1,4 +1,4 @@
-"""The expert with a recorder that lacks one of the sim's topics."""
+"""The expert with a recorder that does not receive one of the sim node's topics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sim node with a recorder that does not hear the commander: no step goes unrecorded."""
+"""The sim node with a recorder that lacks gripper commands: no step stays unrecorded."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ MAX_STEPS = 3
 
 
 @pytest.fixture(scope="module")
-def hearing(graph):
-    """The recorder gets gripper commands only where a test passes them on."""
+def lossy(graph):
+    """The recorder only receives the gripper commands that a test passes on."""
     graph.start("recorder", dataset=graph.folder / "data", remaps={"command/gripper": "passed_on"})
     graph.start(
         "sim_node",
@@ -34,13 +34,13 @@ def hearing(graph):
     commander.node.create_subscription(DiagnosticArray, "episode", lambda _: None, LATCHED)
     passed_on = commander.node.create_publisher(JointState, "passed_on", MAPPED)
     graph._executor.add_node(commander.node)
-    yield Hearing(graph, commander, seen, passed_on)
+    yield Lossy(graph, commander, seen, passed_on)
     graph._executor.remove_node(commander.node)
     commander.close()
     graph.stop("recorder")
 
 
-class Hearing:
+class Lossy:
     def __init__(self, graph, commander, seen, passed_on):
         self.graph = graph
         self.commander = commander
@@ -56,9 +56,9 @@ class Hearing:
                 return found
 
     def after(self, observation):
-        """The one that follows; until then this one is answered as often as it is repeated."""
+        """The next observation; until it comes, this one is answered each time it is repeated."""
         while True:
-            self.commander.say(observation)
+            self.commander.send(observation)
             self.pass_on(observation)
             found = self.observation()
             if found != observation:
@@ -75,35 +75,35 @@ class Hearing:
         )[0]
 
 
-def test_first_observation_is_repeated_until_the_recorder_has_its_answer(graph, hearing):
-    first = hearing.observation()
+def test_first_observation_is_repeated_until_the_recorder_has_its_answer(graph, lossy):
+    first = lossy.observation()
     for _ in range(3):
-        hearing.commander.say(first)
-        again = hearing.observation()
+        lossy.commander.send(first)
+        again = lossy.observation()
         assert again == first
-    second = hearing.after(first)
-    third = hearing.after(second)
+    second = lossy.after(first)
+    third = lossy.after(second)
     assert [stamp_ns(m) - stamp_ns(first) for m in (second, third)] == [PERIOD_NS, 2 * PERIOD_NS]
-    hearing.commander.say(third)
-    hearing.pass_on(third)
-    event = hearing.end(0)
+    lossy.commander.send(third)
+    lossy.pass_on(third)
+    event = lossy.end(0)
     assert event.event == "ended"
     assert graph.recorded(event.id).message == f"closed {event.id}"
     episode = read_episode(graph.folder / "data" / "episodes" / event.id)
     assert episode.findings == ()
     assert len(episode) == MAX_STEPS
-    said = [s for s in graph.recorders if s.hardware_id == event.id]
-    states = [s.message.partition(" ")[0] for s in said]
-    # Once more for each topic that comes later than the gripper's.
+    statuses = [s for s in graph.recorders if s.hardware_id == event.id]
+    states = [s.message.partition(" ")[0] for s in statuses]
+    # One more status for each topic that arrives after the gripper's.
     assert (set(states[:-1]), states[-1]) == ({"recording"}, "closed")
-    assert not any(key.startswith("count/") for key in said[0].values)
-    assert "1" in [s.values.get("count/command/gripper") for s in said[1:-1]]
+    assert not any(key.startswith("count/") for key in statuses[0].values)
+    assert "1" in [s.values.get("count/command/gripper") for s in statuses[1:-1]]
 
 
-def test_recorder_that_never_has_it_aborts_the_episode(graph, hearing):
-    observation = hearing.observation(hearing.end(0).end_ns)
-    hearing.commander.say(observation)
-    event = hearing.end(1)
+def test_recorder_that_never_has_it_aborts_the_episode(graph, lossy):
+    observation = lossy.observation(lossy.end(0).end_ns)
+    lossy.commander.send(observation)
+    event = lossy.end(1)
     assert event.reason == "aborted: the first step does not reach recorder"
     assert event.end_ns == event.start_ns
     code, log = graph.expect_exit("sim_node")
