@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from curation_ros.core.decision.decision import CURATOR, Decision, Verdict, untrustworthy
+from curation_ros.core.decision.decision import Decision, Verdict, untrustworthy
 from curation_ros.core.decision.examination import Examination
 from curation_ros.core.decision.fitted_rule import FittedRule
 from curation_ros.core.decision.rules import Rule
 from curation_ros.core.types import NS_PER_S, Span
 
 
-def decide(
-    examination: Examination, fitted_rule: FittedRule, *, revision: int = 1, by: str = CURATOR
-) -> Decision:
+def decide(examination: Examination, fitted_rule: FittedRule) -> Decision:
     """Decide on one episode: a pure function of what is given.
 
     1. A recording that cannot be trusted is for review whatever its scores, with its finding as
@@ -28,8 +26,6 @@ def decide(
     Args:
         examination: of the episode.
         fitted_rule: fitted with the scorers that examined it.
-        revision: number of the decision.
-        by: its author.
     """
     rule, scores = fitted_rule.rule, examination.scores
     facts: dict[str, Any] = {
@@ -57,8 +53,6 @@ def decide(
         abstained=dict(examination.abstained),
         findings=examination.findings,
         evidence={**examination.evidence, **facts},
-        revision=revision,
-        by=by,
         state_hash=fitted_rule.state_hash,
     )
 

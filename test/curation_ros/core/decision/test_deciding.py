@@ -30,9 +30,9 @@ def test_decision_covers_the_whole_episode_and_carries_what_it_was_given() -> No
         "e", "pick-1", 10, (0, 90), {"s": 1.0, "t": None}, {"t": "why"}, evidence={"x": [1, 2]}
     )
     rule = replace(at_zero(), scoring_hash="f00", state_hash="abc")
-    got = decide(examination, rule, revision=3, by="curator")
+    got = decide(examination, rule)
     assert (got.verdict, got.span) == ("keep", (0, 90))
-    assert (got.episode, got.name, got.revision, got.by) == ("e", "pick-1", 3, "curator")
+    assert (got.episode, got.name, got.revision, got.by) == ("e", "pick-1", 1, "curator")
     assert (got.scores, got.abstained) == ({"s": 1.0, "t": None}, {"t": "why"})
     assert got.state_hash == "abc"
     assert got.evidence == {
