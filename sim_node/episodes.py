@@ -30,7 +30,6 @@ class EpisodeResult:
     Attributes:
         start: name of the start state.
         is_success: whether the goal held after any step.
-        is_success_at_end: whether it held after the last step.
         n_steps: commands executed.
         success_step: index of the command after which the goal held for the first time.
         stage: name of the last phase reached.
@@ -40,7 +39,6 @@ class EpisodeResult:
 
     start: str
     is_success: bool
-    is_success_at_end: bool
     n_steps: int
     success_step: int | None
     stage: str
@@ -60,7 +58,6 @@ class Run:
     Attributes:
         n_steps: commands executed so far.
         success_step: index of the command after which the goal held for the first time.
-        is_success_now: whether the goal held after the last command.
         stage: name of the phase reached; empty before the first step.
         phase_steps: steps in each phase so far.
 
@@ -77,7 +74,6 @@ class Run:
         self.start = start
         self.n_steps = 0
         self.success_step: int | None = None
-        self.is_success_now = False
         self.stage = ""
         self.phase_steps = [0] * len(task.phases)
 
@@ -102,8 +98,7 @@ class Run:
             observation = env.step(*command)
             self.phase_steps[phase_index] += 1
             self.n_steps += 1
-            self.is_success_now = env.is_success()
-            if self.is_success_now and self.success_step is None:
+            if self.success_step is None and env.is_success():
                 self.success_step = self.n_steps - 1
             if (
                 self.success_step is not None
@@ -116,7 +111,6 @@ class Run:
         return EpisodeResult(
             start=self.start.name,
             is_success=self.success_step is not None,
-            is_success_at_end=self.is_success_now,
             n_steps=self.n_steps,
             success_step=self.success_step,
             stage=self.stage,

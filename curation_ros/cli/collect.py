@@ -10,7 +10,9 @@ from rich.progress import Progress
 
 from curation_ros.cli.arguments import add_workers
 from curation_ros.cli.output import print_json, progress_console, say, warn
+from sim_node.defects import DEFECTS
 from sim_node.settings import MAX_STEPS, SIMULATED_TASK
+from sim_node.tasks import TASKS
 
 _DONE, _NOTHING = 0, 3
 
@@ -23,13 +25,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--simulated-task",
         default=SIMULATED_TASK,
         metavar="NAME",
-        help=f"what is simulated, a file of sim_node/tasks (default: {SIMULATED_TASK})",
+        help=f"what is simulated: {', '.join(TASKS)} (default: {SIMULATED_TASK})",
     )
     parser.add_argument(
         "--contamination", type=float, default=0.0, metavar="F", help="fraction of defective ones"
     )
+    kinds = "; ".join(f"{d.name}, {d.description}" for d in DEFECTS.values() if d.name != "none")
     parser.add_argument(
-        "--defect", default="early_release", help="kind of the defect (default: early_release)"
+        "--defect",
+        default="early_release",
+        metavar="KIND",
+        help=f"kind of the defect: {kinds} (default: early_release)".replace("%", "%%"),
     )
     parser.add_argument(
         "--paired", action="store_true", help="defective ones reuse the starts of clean ones"

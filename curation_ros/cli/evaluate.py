@@ -16,6 +16,7 @@ from curation_ros.configuration import topic_map_or_default
 from curation_ros.core.errors import ConfigError
 from curation_ros.study.graph_rollouts import evaluate_on_graph, summary
 from sim_node.settings import MAX_STEPS, SIMULATED_TASK
+from sim_node.tasks import TASKS, start_names
 
 _MOST_STEPS = 100_000  # the limit of sim_node
 
@@ -30,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--simulated-task",
         default=SIMULATED_TASK,
         metavar="NAME",
-        help=f"what is simulated, a file of sim_node/tasks (default: {SIMULATED_TASK})",
+        help=f"what is simulated: {', '.join(TASKS)} (default: {SIMULATED_TASK})",
     )
     parser.add_argument(
         "--max-steps",
@@ -92,7 +93,6 @@ def _rollouts(args: argparse.Namespace, policy_id: str) -> Iterator[dict[str, An
             shutil.rmtree(logs, ignore_errors=True)
         return
     from curation_ros.study.unit_work import roll_policy
-    from sim_node.tasks import start_names
 
     rollouts = [
         (args.policy, start, args.max_steps, args.simulated_task, args.topic_map)

@@ -19,7 +19,6 @@ PHASES = ("PREGRASP", "DESCEND", "GRASP", "LIFT", "TRANSPORT", "RELEASE")
 PREGRASP, DESCEND, GRASP, LIFT, TRANSPORT, RELEASE = range(len(PHASES))
 
 _UP = np.array([0.0, 0.0, 1.0])
-_SLOWEST, _FASTEST = 0.12, 0.28
 
 
 @dataclass(frozen=True)
@@ -161,35 +160,23 @@ def _ratio(part: float, whole: float) -> float:
     return float(part / whole) if abs(whole) > 1e-9 else 1.0
 
 
-@dataclass(frozen=True)
-class ExpertParams:
-    """How much experts vary; each range is drawn from once per episode unless noted otherwise.
-
-    The defaults are tuned on generated starts.
-
-    Attributes:
-        speed_range: fastest action in each axis; 0.2 is about 3 mm per step.
-        phase_speed_sigma: log-normal spread of the pace of each phase.
-        waypoint_std_m: spread of each waypoint in x and y; half of it in z; cut at 2 sigma.
-        hesitation_steps: most steps of slow motion at the start of a phase, drawn for each.
-        hesitation_speed: pace during hesitation, as a fraction.
-        tremor_std: spread of the slow noise added to actions.
-        tremor_time_steps: correlation time of the tremor.
-        carry_height_range_m: how much higher than the release the object is carried.
-        gain_per_m: action per metre of distance to the waypoint.
-        max_action: largest action in each axis, tremor included.
-    """
-
-    speed_range: tuple[float, float] = (0.16, 0.25)
-    phase_speed_sigma: float = 0.08
-    waypoint_std_m: float = 0.002
-    hesitation_steps: int = 8
-    hesitation_speed: float = 0.3
-    tremor_std: float = 0.02
-    tremor_time_steps: float = 15.0
-    carry_height_range_m: tuple[float, float] = (0.10, 0.14)
-    gain_per_m: float = 10.0
-    max_action: float = 0.3
+# How much experts vary, tuned on generated starts. Each range is drawn from once per episode.
+#: Fastest action in each axis (0.2 is about 3 mm per step), and limits after the pace of a phase.
+_SPEED_RANGE, _SLOWEST, _FASTEST = (0.16, 0.25), 0.12, 0.28
+#: Log-normal spread of the pace of each phase.
+_PHASE_SPEED_SIGMA = 0.08
+#: Spread of each waypoint in x and y; half of it in z; cut at 2 sigma.
+_WAYPOINT_STD_M = 0.002
+#: Most steps of slow motion at the start of a phase, drawn for each; and their pace.
+_HESITATION_STEPS, _HESITATION_SPEED = 8, 0.3
+#: Spread of the slow noise on actions, and its correlation time.
+_TREMOR_STD, _TREMOR_TIME_STEPS = 0.02, 15.0
+#: How much higher than the release the object is carried.
+_CARRY_HEIGHT_RANGE_M = (0.10, 0.14)
+#: Action per metre of distance to the waypoint.
+_GAIN_PER_M = 10.0
+#: Largest action in each axis, tremor included.
+_MAX_ACTION = 0.3
 
 
 class PickAndPlaceExpert:
@@ -205,25 +192,16 @@ class PickAndPlaceExpert:
         moved_object: name of the object.
         goal_object: name of the goal.
         seed: seed of everything that varies.
-        params: how much it varies.
     """
 
-    def __init__(
-        self,
-        geometry: Geometry,
-        moved_object: str,
-        goal_object: str,
-        seed: int,
-        params: ExpertParams | None = None,
-    ) -> None:
+    def __init__(self, geometry: Geometry, moved_object: str, goal_object: str, seed: int) -> None:
         self._geometry = geometry
         self._names = moved_object, goal_object
-        self.params = p = params if params is not None else ExpertParams()
         self._rng = rng = np.random.default_rng(seed)
         n = len(PHASES)
-        pace = np.exp(rng.normal(0.0, p.phase_speed_sigma, n))
-        self._speed = np.clip(rng.uniform(*p.speed_range) * pace, _SLOWEST, _FASTEST)
-        offset = np.clip(rng.normal(0.0, 1.0, (n, 3)), -2.0, 2.0) * p.waypoint_std_m
+        pace = np.exp(rng.normal(0.0, _PHASE_SPEED_SIGMA, n))
+        self._speed = np.clip(rng.uniform(*_SPEED_RANGE) * pace, _SLOWEST, _FASTEST)
+        offset = np.clip(rng.normal(0.0, 1.0, (n, 3)), -2.0, 2.0) * _WAYPOINT_STD_M
         offset[:, 2] *= 0.5
         # Never higher in a phase that ends below a threshold close to the waypoint.
         for phase in (DESCEND, GRASP, TRANSPORT, RELEASE):
@@ -233,9 +211,9 @@ class PickAndPlaceExpert:
         offset[LIFT, :2] = offset[DESCEND, :2]
         offset[RELEASE] = offset[TRANSPORT]
         self._offset_m = offset
-        self._hesitation = rng.integers(0, p.hesitation_steps + 1, n)
-        self._carry_height_m = rng.uniform(*p.carry_height_range_m)
-        self._tremor = rng.normal(0.0, p.tremor_std, 3)
+        self._hesitation = rng.integers(0, _HESITATION_STEPS + 1, n)
+        self._carry_height_m = rng.uniform(*_CARRY_HEIGHT_RANGE_M)
+        self._tremor = rng.normal(0.0, _TREMOR_STD, 3)
         self._phase = -1
         self._steps_in_phase = 0
         self._points_m: tuple[Floats, Floats] | None = None
@@ -249,14 +227,15 @@ class PickAndPlaceExpert:
         waypoint_m = self._waypoint(observation, phase_index)
         limit = float(self._speed[phase_index])
         if self._steps_in_phase < self._hesitation[phase_index]:
-            limit *= self.params.hesitation_speed
+            limit *= _HESITATION_SPEED
         self._steps_in_phase += 1
 
-        action = self.params.gain_per_m * (waypoint_m - observation.eef_position_m)
+        action = _GAIN_PER_M * (waypoint_m - observation.eef_position_m)
         action = np.clip(action, -limit, limit) + self._next_tremor()
         is_closed = GRASP <= phase_index <= TRANSPORT
-        limit = self.params.max_action
-        return np.clip(action, -limit, limit), GRIPPER_CLOSE if is_closed else GRIPPER_OPEN
+        return np.clip(
+            action, -_MAX_ACTION, _MAX_ACTION
+        ), GRIPPER_CLOSE if is_closed else GRIPPER_OPEN
 
     def _waypoint(self, observation: Observation, phase_index: int) -> Floats:
         geometry = self._geometry
@@ -281,7 +260,7 @@ class PickAndPlaceExpert:
         return waypoint_m
 
     def _next_tremor(self) -> Floats:
-        keep = np.exp(-1.0 / self.params.tremor_time_steps)
-        fresh = self._rng.normal(0.0, self.params.tremor_std, 3)
+        keep = np.exp(-1.0 / _TREMOR_TIME_STEPS)
+        fresh = self._rng.normal(0.0, _TREMOR_STD, 3)
         self._tremor = keep * self._tremor + np.sqrt(1.0 - keep**2) * fresh
         return self._tremor
