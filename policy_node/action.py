@@ -120,10 +120,6 @@ class ActionSpec:
         every: Floats = np.concatenate(columns, axis=1)[inside]
         return every
 
-    def targets(self, episode: Episode, span: Span | None = None) -> Floats:
-        """(T, A) what the network should answer, in [-1, 1]; arguments as of `scaled`."""
-        return np.clip(self.scaled(episode, span), -1.0, 1.0)
-
     def clipped_shares(self, scaled: Floats) -> dict[str, float]:
         """Share of the values of each field that are beyond its scale, of (T, A) `scaled`.
 

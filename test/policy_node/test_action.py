@@ -22,6 +22,11 @@ def libero(scale=0.2):
     )
 
 
+def targets_of(action, episode, span=None):
+    """What the network should answer."""
+    return np.clip(action.scaled(episode, span), -1.0, 1.0)
+
+
 def with_gripper(**changes):
     return replace(TOPIC_MAP, gripper=replace(TOPIC_MAP.gripper, **changes))
 
@@ -32,7 +37,7 @@ def test_variant_of_libero_is_twist_and_gripper():
 
 def test_scale_round_trip():
     episode, action = demonstration(0), libero()
-    targets = action.targets(episode)
+    targets = targets_of(action, episode)
     assert targets.shape == (60, action.width) == (60, 4)
     commands = [action.command(row) for row in targets]
     twists = [command["twist"] for command in commands]
@@ -46,7 +51,7 @@ def test_faster_commands_are_clipped_and_counted_per_field():
     twist[:6, 0] = 0.5
     twist[6:12, 1] = 0.2
     episode, action = with_commands(demonstration(0), twist=twist), libero()
-    assert np.abs(action.targets(episode)).max() == 1.0
+    assert np.abs(targets_of(action, episode)).max() == 1.0
     assert action.clipped_shares(action.scaled(episode)) == {"twist": pytest.approx(6 / 180)}
 
 
@@ -54,11 +59,11 @@ def test_hold_takes_the_last_command_even_from_before_the_span():
     gripper = np.zeros((60, 1))
     gripper[10], gripper[40] = 1.0, -1.0
     episode = with_commands(demonstration(0), gripper=gripper)
-    targets = libero().targets(episode)[:, 3]
+    targets = targets_of(libero(), episode)[:, 3]
     assert (targets[:10] == 0).all()
     assert (targets[10:40] == 1).all()
     assert (targets[40:] == -1).all()
-    cut = libero().targets(episode, (21 * PERIOD_NS, 30 * PERIOD_NS))
+    cut = targets_of(libero(), episode, (21 * PERIOD_NS, 30 * PERIOD_NS))
     assert (cut[:, 3] == 1).all()
 
 
@@ -74,7 +79,7 @@ def test_gripper_is_commanded_in_the_numbers_of_the_robot():
     command[20:40] = 0.002
     episode = replace(with_commands(demonstration(0), gripper=command), topic_map=topic_map)
     action = action_spec([CommandTerm("gripper")], topic_map, (), "x")
-    targets = action.targets(episode)
+    targets = targets_of(action, episode)
     assert targets[:20].tolist() == [[-1.0]] * 20
     assert targets[20:40].tolist() == [[1.0]] * 20
     answers = [action.command(np.array([output]))["gripper"] for output in (-1.0, 1.0, 0.0)]
@@ -105,8 +110,8 @@ def test_twist_that_is_not_finite_is_refused_inside_the_span_only():
     twist[50, 2] = np.inf
     episode = with_commands(demonstration(0), twist=twist)
     with pytest.raises(PolicyError, match="twist in row 50 is not finite"):
-        libero().targets(episode)
-    assert len(libero().targets(episode, (0, 30 * PERIOD_NS))) == 30
+        targets_of(libero(), episode)
+    assert len(targets_of(libero(), episode, (0, 30 * PERIOD_NS))) == 30
     term = CommandTerm("twist")
     with pytest.raises(PolicyError, match="twist in row 50 is not finite"):
         action_spec([term], TOPIC_MAP, [(episode, None)], "x")
@@ -142,7 +147,7 @@ def test_center_from_the_demonstrations_is_the_middle_of_each_value():
     action = action_spec([term], TOPIC_MAP, [(episode, None)], "x")
     np.testing.assert_allclose(action.commands[0].center, [1.5, 5.0, -2.7])
     np.testing.assert_allclose(action.commands[0].scale, [0.5, 1.0, 0.4])
-    targets = action.targets(episode)
+    targets = targets_of(action, episode)
     assert action.clipped_shares(action.scaled(episode)) == {"twist": 0.0}
     commands = [action.command(row)["twist"] for row in targets]
     np.testing.assert_allclose(commands, twist, atol=1e-12)
