@@ -208,4 +208,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    # Beside this script lie folders of tests with the names of our packages.
+    sys.path[0] = str(ROOT)
     raise SystemExit(main())
