@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from curation_ros.api import open as open
     from curation_ros.api import read_episode as read_episode
     from curation_ros.api import score as score
-    from curation_ros.batch.score import Scored as Scored
+    from curation_ros.batch.scored import Scored as Scored
     from curation_ros.core.decision.decision import Decision as Decision
     from curation_ros.core.decision.manifest import Manifest as Manifest
     from curation_ros.core.episode.episode import Episode as Episode
@@ -47,7 +47,7 @@ _HOMES = {
     "read_episode": "curation_ros.api",
     "Collection": "curation_ros.api",
     "ScoredEpisodes": "curation_ros.api",
-    "Scored": "curation_ros.batch.score",
+    "Scored": "curation_ros.batch.scored",
     "Episode": "curation_ros.core.episode.episode",
     "Finding": "curation_ros.core.episode.findings",
     "TopicMap": "curation_ros.core.episode.topic_map",

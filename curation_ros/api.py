@@ -12,13 +12,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias, overload
 
-from curation_ros.batch.score import (
-    Scored,
-    ScoringResult,
-    Unreadable,
-    score_episodes,
-    score_recordings,
-)
+from curation_ros.batch.score import score_episodes, score_recordings
+from curation_ros.batch.scored import Scored, ScoringResult, Unreadable
 from curation_ros.configuration import read_reference, settings_of
 from curation_ros.core.decision.decision import VERDICTS, Decision
 from curation_ros.core.decision.manifest import Manifest

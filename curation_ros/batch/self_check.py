@@ -16,7 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from curation_ros.batch.score import Scored, Scoring
+from curation_ros.batch.score import Scoring
+from curation_ros.batch.scored import Scored
 from curation_ros.configuration import read_reference
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import CURATOR, Decision, Verdict

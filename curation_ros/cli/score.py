@@ -9,7 +9,8 @@ from pathlib import Path
 from rich.progress import track
 
 from curation_ros.batch.examine import Examined
-from curation_ros.batch.score import Scored, Scoring, ScoringResult, Unreadable, score_recordings
+from curation_ros.batch.score import Scoring, score_recordings
+from curation_ros.batch.scored import Scored, ScoringResult, Unreadable
 from curation_ros.cli.arguments import add_config, add_reference, add_rule, add_workers
 from curation_ros.cli.output import console, print_json, progress_console, warn
 from curation_ros.cli.score_table import score_table

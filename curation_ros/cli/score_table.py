@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.table import Table
 from rich.text import Text
 
-from curation_ros.batch.score import Scored
+from curation_ros.batch.scored import Scored
 from curation_ros.cli.output import VERDICT_STYLE, console, progress_console
 from curation_ros.core.decision.decision import CURATOR, Decision
 from curation_ros.core.types import NS_PER_S

@@ -14,7 +14,8 @@ from streams import record
 
 from curation_ros.batch import score as module
 from curation_ros.batch.examine import Examined
-from curation_ros.batch.score import Scored, Scoring, Unreadable, decide_dataset, score_recordings
+from curation_ros.batch.score import Scoring, decide_dataset, score_recordings
+from curation_ros.batch.scored import Scored, Unreadable
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.identity import new_episode_id
