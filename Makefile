@@ -1,7 +1,7 @@
 # make demo    the whole path in front of you: record, score, decide, train, drive (5 minutes)
 # make quick   checks, and the tests that need no ROS, simulator or torch (a minute)
 # make test    checks and all tests, as CI runs them
-# make docs    docs/metrics.md anew, from the code
+# make docs    writes the generated pages of docs
 # make bench   the benchmarks (half an hour)
 # make benchmark   the paper's experiment: collect, score, select, train, roll out, report (an hour)
 # Each makes .venv by itself. A CPU-only torch: make TORCH_BACKEND=cpu demo
@@ -9,9 +9,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# What is installed; a smaller machine takes less, for instance EXTRAS=ros,test
+# Extras to install. On a small machine, take fewer, for instance EXTRAS=ros,test
 EXTRAS ?= ros,sim,policy,report,test
-# Any requirement on torch, for instance TORCH=torch==2.13.0
+# A requirement on torch, for instance TORCH=torch==2.13.0
 TORCH ?=
 ifdef TORCH_BACKEND
 export UV_TORCH_BACKEND := $(TORCH_BACKEND)
@@ -20,8 +20,8 @@ endif
 READY := $(VENV)/.ready-$(EXTRAS)
 # For `make quick`, any installation with the extra test will do.
 QUICK := $(firstword $(wildcard $(VENV)/.ready-*test) $(VENV)/.ready-test)
-# Two of the workers fit into 8 GB. A file's tests stay together, because they share fixtures.
 PYTEST := $(BIN)/python -m pytest
+# The tests of a file stay together, because they share fixtures.
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
 .PHONY: setup demo quick test check bench benchmark docs clean
@@ -38,7 +38,7 @@ $(BIN)/uv:
 
 $(VENV)/.ready-%: setup.py package.xml curation_ros/nodes/programs.py $(wildcard launch/* config/*) | $(BIN)/uv
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[$*]' $(if $(TORCH),'$(TORCH)')
-	@# An editable installation leaves out what ros2 run and ros2 launch look up; colcon does this too.
+	@# An editable installation leaves out the files that ros2 run and ros2 launch look for.
 	@$(BIN)/python -W ignore setup.py --quiet install_data --install-dir $(abspath $(VENV))
 	@touch $@
 
@@ -73,10 +73,10 @@ docs: setup
 bench: setup
 	$(BIN)/python benchmarks/run.py
 
-# It goes on where it was; another study: make benchmark STUDY=config/question.yaml
+# It resumes. Another study: make benchmark STUDY=config/question.yaml
 STUDY ?= config/paper.yaml
 benchmark: setup
 	@$(BIN)/curation benchmark --config $(STUDY)
 
 clean:
-	rm -rf $(VENV) build install log *.egg-info .*_cache .hypothesis
+	rm -rf $(VENV) build install log libexec *.egg-info .*_cache .hypothesis
