@@ -15,8 +15,6 @@ FILES = [
 CLASS_LINES, FUNCTION_LINES = 250, 60
 #: Definitions that are longer. The list only gets shorter.
 LONGER = {
-    "curation_ros/core/decision/deciding.py:decide",
-    "curation_ros/dataset/manifests.py:save_selection",
     "curation_ros/testing/episodes.py:make_episode",
     "sim_node/libero/osc.py:control_step",
 }
