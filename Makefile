@@ -59,7 +59,8 @@ check: setup
 
 quick: $(QUICK)
 	$(CHECKS)
-	$(PYTEST) $(PARALLEL) -m 'not ros and not sim and not policy'
+	@# One thread of linear algebra per worker, because more threads wait for each other.
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(PYTEST) $(PARALLEL) -m 'not ros and not sim and not policy and not slow'
 
 # The tests of the graph come last and one by one: they share the machine with their nodes.
 test: check

@@ -20,6 +20,8 @@ from curation_ros.core.statistics.detection import auroc, auroc_interval
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.labels import read_labels
 
+pytestmark = pytest.mark.slow
+
 FAST = ("gripper_timing", "knn", "length")
 DRAWS = {"n_permutations": 199, "n_resamples": 200}
 

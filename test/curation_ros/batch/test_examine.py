@@ -27,6 +27,8 @@ from curation_ros.core.episode.identity import new_episode_id
 from curation_ros.core.errors import BagError, ConfigError, CurationError
 from curation_ros.dataset.dataset import Dataset
 
+pytestmark = pytest.mark.slow
+
 SCORERS = ("gripper_timing", "knn", "length")
 N_BAGS = 40
 

@@ -23,6 +23,8 @@ from curation_ros.core.scorers import SCORERS, Look
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.decision_log import log_decision, log_override
 
+pytestmark = pytest.mark.slow
+
 TRUTH: dict[str, Any] = {
     "name": "pick-0",
     "outcome": "succeeded",

@@ -10,6 +10,8 @@ from peeking import Peeker
 from curation_ros.core.scorers import SCORERS
 from curation_ros.dataset.dataset import Dataset
 
+pytestmark = pytest.mark.slow
+
 PROVEN, DIFFERS, USAGE, NOTHING = 0, 1, 2, 3
 Run = Callable[..., Any]
 

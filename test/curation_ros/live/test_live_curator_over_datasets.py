@@ -24,6 +24,8 @@ from curation_ros.core.errors import EpisodeError
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.dataset.manifests import save_selection
 
+pytestmark = pytest.mark.slow
+
 # --- rules over the dataset ---------------------------------------------------------------------
 
 

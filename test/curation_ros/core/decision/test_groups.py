@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from curation_ros.core.decision.groups import METHODS, MIN_SCORES, split_scores
 from curation_ros.core.errors import ConfigError
 
+pytestmark = pytest.mark.slow
+
 Draw = Callable[[np.random.Generator, int], np.ndarray]
 ONE_GROUP: dict[str, Draw] = {
     "normal": lambda rng, n: rng.normal(size=n),

@@ -32,6 +32,8 @@ from curation_ros.core.scorers import (
 from curation_ros.dataset.dataset import Dataset
 from curation_ros.version import __version__
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[4]
 
 PAUSES = '''
