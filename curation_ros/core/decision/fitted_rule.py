@@ -13,6 +13,7 @@ from curation_ros.core.decision.rules import Rule
 from curation_ros.core.decision.state_hash import state_hash
 from curation_ros.core.decision.ties import TieKey
 from curation_ros.core.errors import EpisodeError
+from curation_ros.core.scorers.registry import contained
 
 if TYPE_CHECKING:
     from curation_ros.core.episode.episode import Episode
@@ -174,7 +175,7 @@ def _scores_of(fitted: FittedScorers, name: str, episodes: Sequence[Episode]) ->
     scorer = fitted.scorers[name]
     found = []
     for episode in views(scorer, episodes, fitted.length):
-        with suppress(EpisodeError):
+        with suppress(EpisodeError), contained(name):
             found.append(scorer.score(episode))
     return found
 
@@ -193,10 +194,13 @@ def _held_out_scores(
         scorer = whole
         if n_folds > 1:
             ids = {e.id for e in held_out}
-            scorer = fitted.settings.make_scorer(name).fit([e for e in shown if e.id not in ids])
+            with contained(name):
+                scorer = fitted.settings.make_scorer(name)
+                scorer.fit([e for e in shown if e.id not in ids])
         for episode in held_out:
             try:
-                scores[episode.id] = scorer.score(episode)
+                with contained(name):
+                    scores[episode.id] = scorer.score(episode)
             except EpisodeError as err:
                 raise EpisodeError(
                     f"reference episode {episode.name} ({episode.id}): "

@@ -15,10 +15,11 @@ from episodes import make_episode, make_reference
 from other_packages import install
 from streams import record
 
+from curation_ros.core.decision.fitted_rule import fit_rule
 from curation_ros.core.decision.fitted_scorers import fit_scorers
 from curation_ros.core.decision.settings import CurationSettings
 from curation_ros.core.episode.episode import Episode
-from curation_ros.core.errors import ConfigError
+from curation_ros.core.errors import ConfigError, EpisodeError
 from curation_ros.core.scorers import (
     SCORERS,
     Look,
@@ -190,6 +191,35 @@ def test_fault_in_a_scorer_of_another_package_is_its_reason_to_abstain(
     scores, abstained = fitted.score(make_episode(rng))
     assert scores == {"pauses": None, "length": -240.0}
     assert abstained["pauses"].startswith(reason)
+
+
+FIT_SOME = """    needs = "reference"
+
+    def fit(self, episodes):
+        self.n_ = len(episodes) / (len(episodes) == 4)
+        return self
+"""
+LOOK_SOME = """    def look(self, episode):
+        return Look(episode.field("twist")[10**6])
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        (PAUSES.replace('    needs = "nothing"\n', FIT_SOME), "ZeroDivisionError: "),
+        (PAUSES.partition("    def look")[0] + LOOK_SOME, "IndexError: index 1000000"),
+    ],
+    ids=["fit without one of the reference", "look"],
+)
+def test_fault_in_a_scorer_that_decides_ends_with_its_reason(
+    installed: Any, rng: np.random.Generator, code: str, reason: str
+) -> None:
+    installed({"pauses": "arm_scorers:Pauses"}, code)
+    settings = CurationSettings(scorers=("pauses",), rule="threshold", rule_scorer="pauses")
+    reference = make_reference(rng)[:4]
+    with pytest.raises(EpisodeError, match=reason):
+        fit_rule(fit_scorers(settings, reference), reference)
 
 
 def test_fault_in_a_scorer_of_ours_is_raised(
