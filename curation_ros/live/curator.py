@@ -16,7 +16,7 @@ from curation_ros.core.decision.fitted_rule import FittedRule
 from curation_ros.core.episode.builder import EpisodeBuilder
 from curation_ros.core.episode.episode import Episode
 from curation_ros.core.episode.findings import Finding
-from curation_ros.core.episode.gate import Closed, EpisodeGate
+from curation_ros.core.episode.gate import DRAIN_S, Closed, EpisodeGate
 from curation_ros.core.episode.status import EpisodeEvent, owner_findings
 from curation_ros.core.episode.stream import Decoder, Sample
 from curation_ros.core.episode.topic_map import TopicMap
@@ -87,7 +87,7 @@ class LiveCurator:
         decoder: Decoder,
         curation: Curation,
         *,
-        drain_timeout_s: float = 3.0,
+        drain_timeout_s: float = DRAIN_S,
     ) -> None:
         """Start without an episode.
 

@@ -13,7 +13,7 @@ from curation_ros.bags import open_bag
 from curation_ros.bags.qos import QosProfile
 from curation_ros.bags.recovery import recover_bag
 from curation_ros.bags.writer import BagWriter
-from curation_ros.core.episode.gate import Closed, EpisodeGate
+from curation_ros.core.episode.gate import DRAIN_S, Closed, EpisodeGate
 from curation_ros.core.episode.status import EpisodeEvent, event_to_json
 from curation_ros.core.episode.stream import Sample
 from curation_ros.core.episode.topic_map import TopicMap
@@ -94,7 +94,7 @@ class Recording:
         topics: Mapping[str, RecordedTopic],
         *,
         min_free_mb: float = 500.0,
-        drain_timeout_s: float = 3.0,
+        drain_timeout_s: float = DRAIN_S,
         flush_period_s: float = 0.1,
         publishers: Callable[[str], int] | None = None,
     ) -> None:

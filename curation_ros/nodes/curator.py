@@ -21,6 +21,7 @@ from curation_ros.configuration import (
 )
 from curation_ros.core.decision.curation import Curation
 from curation_ros.core.decision.decision import Decision
+from curation_ros.core.episode.gate import DRAIN_S
 from curation_ros.core.episode.status import (
     alert_to_status,
     counts_to_values,
@@ -35,7 +36,7 @@ from curation_ros.live.curator import Decided, LiveCurator
 from curation_ros.nodes.health import Health
 from curation_ros.nodes.messages import single_from_ros, status_to_ros
 from curation_ros.nodes.parameters import Parameter, declare
-from curation_ros.nodes.qos import DECISIONS, DRAIN_S, EVENTS, LATCHED
+from curation_ros.nodes.qos import DECISIONS, EVENTS, LATCHED
 from curation_ros.nodes.spinning import WorkingNode, run, take_waiting
 from curation_ros.nodes.subscriptions import MappedSubscriptions
 

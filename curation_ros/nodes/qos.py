@@ -24,6 +24,3 @@ LATCHED = _profile(10, DurabilityPolicy.TRANSIENT_LOCAL)
 DECISIONS = _profile(200, DurabilityPolicy.TRANSIENT_LOCAL)
 #: Alerts, overrides, diagnostics.
 EVENTS = _profile(50, DurabilityPolicy.VOLATILE)
-#: How long to wait for late samples, in s. Fast DDS sends a lost message again when it next asks
-#: for acknowledgements, which it does every 3 s.
-DRAIN_S = 5.0

@@ -10,6 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray, KeyValue
 from std_srvs.srv import SetBool, Trigger
 
 from curation_ros.configuration import topic_map_or_default
+from curation_ros.core.episode.gate import DRAIN_S
 from curation_ros.core.episode.status import (
     ERROR,
     OK,
@@ -26,7 +27,7 @@ from curation_ros.nodes.health import Health
 from curation_ros.nodes.manual_episodes import Answer, ManualEpisodes
 from curation_ros.nodes.messages import array_to_ros, single_from_ros
 from curation_ros.nodes.parameters import Parameter, declare
-from curation_ros.nodes.qos import DRAIN_S, EVENTS, LATCHED
+from curation_ros.nodes.qos import EVENTS, LATCHED
 from curation_ros.nodes.spinning import WorkingNode, run, take_all, take_arrived
 from curation_ros.nodes.subscriptions import MappedSubscriptions
 

@@ -13,6 +13,10 @@ from curation_ros.core.episode.status import EpisodeEvent
 from curation_ros.core.episode.stream import Sample
 from curation_ros.core.types import NS_PER_S
 
+#: How long to wait for late samples, in s. The middleware sends a lost message again when it next
+#: asks for acknowledgements: Fast DDS does that every 3 s.
+DRAIN_S = 5.0
+
 
 @dataclass
 class Window:
@@ -82,7 +86,7 @@ class EpisodeGate:
     """
 
     def __init__(
-        self, topics: Iterable[str], *, max_gap_s: float = 0.25, drain_timeout_s: float = 3.0
+        self, topics: Iterable[str], *, max_gap_s: float, drain_timeout_s: float = DRAIN_S
     ) -> None:
         """Make a gate for these topics of the map.
 

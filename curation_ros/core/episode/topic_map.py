@@ -17,6 +17,8 @@ ROLES = ("clock", "observation", "action", "gripper", "phase", "object", "effect
 STAMPS = ("header", "source")
 #: End of a name in `state` and `action` that stands for the first value of a field.
 AT_START = "@start"
+#: Silence longer than this marks an episode, if the map does not say otherwise; seconds.
+MAX_GAP_S = 0.25
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ class TopicMap:
     gripper: GripperSpec | None = None
     state: tuple[str, ...] = ()
     action: tuple[str, ...] = ()
-    max_gap_s: float = 0.25
+    max_gap_s: float = MAX_GAP_S
     command: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -301,7 +303,7 @@ def topic_map_from_json(raw: object, where: str = "topic map") -> TopicMap:
             if column.removesuffix(AT_START) not in fields:
                 raise ConfigError(f"{where}: {key} names {column!r}, which is not a field")
     gripper = raw.get("gripper")
-    max_gap_s = _number(raw.get("max_gap_s", 0.25), f"{where}: max_gap_s")
+    max_gap_s = _number(raw.get("max_gap_s", MAX_GAP_S), f"{where}: max_gap_s")
     if not max_gap_s > 0:
         raise ConfigError(f"{where}: max_gap_s must be positive, found {raw['max_gap_s']!r}")
     command = raw.get("command") or {}

@@ -194,7 +194,7 @@ def test_aborted_closes_at_once(end_ns: int | None) -> None:
 
 
 def test_no_topic_is_awaited_by_a_gate_without_topics() -> None:
-    gate = EpisodeGate(())
+    gate = EpisodeGate((), max_gap_s=MAX_GAP_S)
     gate.event(_started(), 0.0)
     gate.event(_ended(), 0.0)
     assert [c.event.id for c in gate.close_ready(0.0)] == ["a"]
