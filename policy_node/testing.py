@@ -20,6 +20,7 @@ import numpy as np
 
 from curation_ros.core.episode.topic_map import TopicMap
 from curation_ros.core.errors import PolicyError
+from curation_ros.testing.rules import expect, refuses
 from policy_node.policy import CARD, Command, Policy, Values
 
 OBSERVED = "`observed` names every field that `observe` needs, and no other."
@@ -78,11 +79,11 @@ def _check_commands(policy: Policy, steps: Sequence[Values]) -> None:
     for observation in steps:
         policy.observe({name: np.array(array) for name, array in observation.items()})
         command = policy.act()
-        _require(set(command) == set(policy.commanded), COMMANDED)
+        expect(set(command) == set(policy.commanded), COMMANDED)
         for values in command.values():
             is_row = isinstance(values, np.ndarray) and values.ndim == 1
-            _require(is_row and values.dtype.kind == "f", COMMANDED)
-            _require(bool(np.isfinite(values).all()), COMMANDED)
+            expect(is_row and values.dtype.kind == "f", COMMANDED)
+            expect(bool(np.isfinite(values).all()), COMMANDED)
 
 
 def _check_observed(policy: Policy, steps: Sequence[Values], commands: Sequence[Command]) -> None:
@@ -91,30 +92,30 @@ def _check_observed(policy: Policy, steps: Sequence[Values], commands: Sequence[
         alone = _drive(policy, needed)
     except (KeyError, PolicyError):
         raise AssertionError(OBSERVED) from None
-    _require(_are_equal(alone, commands), OBSERVED)
+    expect(_are_equal(alone, commands), OBSERVED)
     for name in policy.observed:
         for k in range(_LEAST_STEPS):
             policy.reset()
             answers = [_answer(policy, values) for values in needed[:k]]
             lacking = {key: values for key, values in needed[k].items() if key != name}
-            _refuses(partial(policy.observe, lacking), REFUSED)
+            refuses(partial(policy.observe, lacking), PolicyError, REFUSED)
             answers += [_answer(policy, values) for values in needed[k:]]
-            _require(_are_equal(answers, commands), UNCHANGED)
+            expect(_are_equal(answers, commands), UNCHANGED)
 
 
 def _check_repetition(
     make: Callable[[], Policy], steps: Sequence[Values], commands: Sequence[Command]
 ) -> None:
     policy, other = make(), make()
-    _refuses(policy.act, NOTHING)
+    refuses(policy.act, PolicyError, NOTHING)
     _answer(policy, steps[0])
     policy.reset()
-    _refuses(policy.act, NOTHING)
+    refuses(policy.act, PolicyError, NOTHING)
     for values, expected in zip(steps, commands, strict=True):
-        _require(_are_equal([_answer(policy, values)], [expected]), ACT_REPEATS)
+        expect(_are_equal([_answer(policy, values)], [expected]), ACT_REPEATS)
         for _ in range(2):
-            _require(_are_equal([policy.act()], [expected]), ACT_REPEATS)
-    _require(_are_equal(_drive(policy, steps), commands), REPEATS)
+            expect(_are_equal([policy.act()], [expected]), ACT_REPEATS)
+    expect(_are_equal(_drive(policy, steps), commands), REPEATS)
     backwards = _drive(make(), steps[::-1])
     policy.reset()
     other.reset()
@@ -123,7 +124,7 @@ def _check_repetition(
         for values, opposite in zip(steps, steps[::-1], strict=True)
     ]
     for answers, expected_ones in zip(zip(*both, strict=True), (commands, backwards), strict=True):
-        _require(_are_equal(answers, expected_ones), SEPARATE)
+        expect(_are_equal(answers, expected_ones), SEPARATE)
 
 
 def _check_arrays(
@@ -139,7 +140,7 @@ def _check_arrays(
             reused[name][...] = values
         policy.observe(reused)
         kept = all(np.array_equal(reused[name], values) for name, values in step.items())
-        _require(kept, LEAVES)
+        expect(kept, LEAVES)
         for values in reused.values():
             values[...] = 0
         answer = policy.act()
@@ -147,8 +148,8 @@ def _check_arrays(
         for values in answer.values():
             if values.flags.writeable:
                 values += 1.0
-        _require(_are_equal([policy.act()], answers[-1:]), OWN_ANSWER)
-    _require(_are_equal(answers, commands), COPIES)
+        expect(_are_equal([policy.act()], answers[-1:]), OWN_ANSWER)
+    expect(_are_equal(answers, commands), COPIES)
 
 
 def _check_files(
@@ -157,14 +158,14 @@ def _check_files(
     kind = type(policy)
     saved = policy.save(folder / "policy")
     raw = json.loads((saved / CARD).read_text())
-    _require((raw.get("kind"), raw.get("id")) == (policy.card.kind, policy.card.id), KIND)
+    expect((raw.get("kind"), raw.get("id")) == (policy.card.kind, policy.card.id), KIND)
     loaded = kind.load(saved)
-    _require(loaded.card == policy.card, SAVED)
-    _require(_are_equal(_drive(loaded, steps), commands), SAVED)
+    expect(loaded.card == policy.card, SAVED)
+    expect(_are_equal(_drive(loaded, steps), commands), SAVED)
     before = _contents(saved)
-    _refuses(partial(policy.save, saved), KEEPS)
-    _require(_contents(saved) == before, KEEPS)
-    _refuses(partial(kind.load, folder / "nothing"), LOADS)
+    refuses(partial(policy.save, saved), PolicyError, KEEPS)
+    expect(_contents(saved) == before, KEEPS)
+    refuses(partial(kind.load, folder / "nothing"), PolicyError, LOADS)
 
 
 def _check_topic_map(policy: Policy, topic_map: TopicMap) -> None:
@@ -174,7 +175,7 @@ def _check_topic_map(policy: Policy, topic_map: TopicMap) -> None:
         raise AssertionError(f"{ACCEPTS} ({err})") from err
     for name in (*policy.observed, *policy.commanded):
         others = {key: spec for key, spec in topic_map.fields.items() if key != name}
-        _refuses(partial(policy.check, replace(topic_map, fields=others)), MISSES)
+        refuses(partial(policy.check, replace(topic_map, fields=others)), PolicyError, MISSES)
 
 
 def _drive(policy: Policy, steps: Iterable[Values]) -> list[Command]:
@@ -196,18 +197,3 @@ def _are_equal(found: Sequence[Command], expected: Sequence[Command]) -> bool:
 
 def _contents(folder: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in folder.iterdir()}
-
-
-def _refuses(attempt: Callable[[], object], rule: str) -> None:
-    try:
-        attempt()
-    except PolicyError:
-        return
-    except Exception as err:
-        raise AssertionError(f"{rule} ({type(err).__name__}: {err})") from err
-    raise AssertionError(rule)
-
-
-def _require(holds: bool, rule: str) -> None:
-    if not holds:
-        raise AssertionError(rule)

@@ -19,8 +19,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from curation_ros.core.errors import ConfigError, CurationError, SimError
+from curation_ros.core.errors import ConfigError, SimError
 from curation_ros.core.types import Floats
+from curation_ros.testing.rules import expect, refuses
 from sim_node.environment import (
     GRIPPER_CLOSE,
     GRIPPER_HOLD,
@@ -107,8 +108,8 @@ def check_environment(make: Callable[[], Environment], states: Sequence[ArrayLik
     env.close()
     other.close()
     env.close()
-    _refuses(partial(env.reset, first), SimError, CLOSED)
-    _refuses(partial(env.step, np.zeros(3), 0.0), SimError, CLOSED)
+    refuses(partial(env.reset, first), SimError, CLOSED)
+    refuses(partial(env.step, np.zeros(3), 0.0), SimError, CLOSED)
 
 
 def check_task(task: Task, starts: Sequence[str], limits: EpisodeLimits | None = None) -> None:
@@ -125,14 +126,14 @@ def check_task(task: Task, starts: Sequence[str], limits: EpisodeLimits | None =
     """
     if len(starts) < 2:
         raise ValueError(f"{len(starts)} starts are given, expected at least 2")
-    _require(len(set(task.phases)) == len(task.phases) >= 2, PHASES)
+    expect(len(set(task.phases)) == len(task.phases) >= 2, PHASES)
     in_order = [name for name in task.phases if name in task.carry_phases]
-    _require(bool(in_order) and in_order == list(task.carry_phases), CARRY)
+    expect(bool(in_order) and in_order == list(task.carry_phases), CARRY)
     _check_starts(task, starts)
     env = task.environment()
     try:
         names = {task.moved_object, task.goal_object}
-        _require(len(names) == 2 and names <= set(env.object_names), OBJECTS)
+        expect(len(names) == 2 and names <= set(env.object_names), OBJECTS)
         for seed, name in enumerate(starts):
             _check_expert(task, env, name, seed, limits or EpisodeLimits())
     finally:
@@ -144,9 +145,9 @@ def check_task(task: Task, starts: Sequence[str], limits: EpisodeLimits | None =
 
 def _check_description(env: Environment) -> None:
     for names in (env.joint_names, env.object_names):
-        _require(len(set(names)) == len(names), NAMES)
-    _require(len(env.joint_names) > 2, NAMES)
-    _require(isinstance(env.control_period_ns, int) and env.control_period_ns > 0, PERIOD)
+        expect(len(set(names)) == len(names), NAMES)
+    expect(len(env.joint_names) > 2, NAMES)
+    expect(isinstance(env.control_period_ns, int) and env.control_period_ns > 0, PERIOD)
 
 
 def _check_observations(env: Environment, state: Floats) -> None:
@@ -157,29 +158,29 @@ def _check_observations(env: Environment, state: Floats) -> None:
     del shapes["objects"]
     for observation in _play(env, state, _commands(0)):
         for name, shape in shapes.items():
-            _require(_is_array(getattr(observation, name), shape), f"{SHAPES} ({name})")
-        _require(list(observation.objects) == list(env.object_names), SHAPES)
+            expect(_is_array(getattr(observation, name), shape), f"{SHAPES} ({name})")
+        expect(list(observation.objects) == list(env.object_names), SHAPES)
         for position, quat in observation.objects.values():
-            _require(_is_array(position, (3,)) and _is_array(quat, (4,)), SHAPES)
+            expect(_is_array(position, (3,)) and _is_array(quat, (4,)), SHAPES)
 
 
 def _check_repetition(env: Environment, other: Environment, first: Floats, second: Floats) -> None:
     expected = _bits(_play(env, first, _commands(1)))
     _play(env, second, _commands(2)[: _N_STEPS // 2])
-    _require(_bits(_play(env, first, _commands(1))) == expected, REPEATS)
-    _require(env.n_steps == _N_STEPS, COUNTS)
-    _require(_bits(_play(other, first, _commands(1))) == expected, REPEATS)
+    expect(_bits(_play(env, first, _commands(1))) == expected, REPEATS)
+    expect(env.n_steps == _N_STEPS, COUNTS)
+    expect(_bits(_play(other, first, _commands(1))) == expected, REPEATS)
     both: tuple[list[Observation], list[Observation]] = ([env.reset(first)], [])
     other.reset(second)
     for one, opposite in zip(_commands(1), _commands(2), strict=True):
         both[0].append(env.step(*one))
         both[1].append(other.step(*opposite))
-    _require(_bits(both[0]) == expected, SEPARATE)
+    expect(_bits(both[0]) == expected, SEPARATE)
     asked = [env.reset(first)]
     for command in _commands(1):
         asked.append(env.step(*command))
-        _require(isinstance(env.is_success(), bool), ASKS)
-    _require(_bits(asked) == expected, ASKS)
+        expect(isinstance(env.is_success(), bool), ASKS)
+    expect(_bits(asked) == expected, ASKS)
 
 
 def _check_arrays(env: Environment, state: Floats) -> None:
@@ -189,9 +190,9 @@ def _check_arrays(env: Environment, state: Floats) -> None:
     for action, gripper in _commands(3):
         command = action.copy()
         env.step(command, gripper)
-        _require(np.array_equal(command, action), LEAVES)
-    _require(np.array_equal(given, state), LEAVES)
-    _require(_bits([kept]) == before, COPIES)
+        expect(np.array_equal(command, action), LEAVES)
+    expect(np.array_equal(given, state), LEAVES)
+    expect(_bits([kept]) == before, COPIES)
 
 
 def _check_motion(env: Environment, state: Floats) -> None:
@@ -201,37 +202,37 @@ def _check_motion(env: Environment, state: Floats) -> None:
             action[axis] = 0.5 * sign
             seen = _play(env, state, [Command(action, GRIPPER_OPEN)] * _N_STEPS)
             moved = seen[-1].eef_position_m - seen[0].eef_position_m
-            _require(int(np.abs(moved).argmax()) == axis and moved[axis] * sign > 0.0, MOVES)
+            expect(int(np.abs(moved).argmax()) == axis and moved[axis] * sign > 0.0, MOVES)
     wide, inside = np.array([3.0, -0.5, 0.0]), np.array([1.0, -0.5, 0.0])
     played = [_play(env, state, [Command(action, 1.0)] * 3) for action in (wide, inside)]
-    _require(_bits(played[0]) == _bits(played[1]), CLIPS)
+    expect(_bits(played[0]) == _bits(played[1]), CLIPS)
 
 
 def _check_gripper(env: Environment, state: Floats) -> None:
     rest = np.zeros(3)
     played = [_play(env, state, [Command(rest, value)] * 3) for value in (0.2, GRIPPER_CLOSE)]
-    _require(_bits(played[0]) == _bits(played[1]), SIGN)
+    expect(_bits(played[0]) == _bits(played[1]), SIGN)
     closed = _play(env, state, [Command(rest, GRIPPER_CLOSE)] * _N_CLOSING)[-1].finger_width_m
     for _ in range(_N_STEPS):
         held = env.step(rest, GRIPPER_HOLD).finger_width_m
-    _require(abs(held - closed) < _STILL_M, HOLDS)
+    expect(abs(held - closed) < _STILL_M, HOLDS)
     opened = _play(env, state, [Command(rest, GRIPPER_OPEN)] * _N_CLOSING)[-1].finger_width_m
-    _require(opened > closed, GRIPS)
+    expect(opened > closed, GRIPS)
 
 
 def _check_refusals(env: Environment, state: Floats) -> None:
     bad = state.copy()
     bad[0] = np.nan
     for wrong in (bad, state[:-1]):
-        _refuses(partial(env.reset, wrong), SimError, BAD_STATE)
+        refuses(partial(env.reset, wrong), SimError, BAD_STATE)
     before = _bits(_play(env, state, _commands(4)))
     seen = [env.reset(state)]
     for k, command in enumerate(_commands(4)):
         for action, gripper in (([0.0, np.nan, 0.0], 1.0), ([0.0, 0.0], 1.0), (bad[:3], np.inf)):
-            _refuses(partial(env.step, action, gripper), SimError, BAD_COMMAND)
-        _require(env.n_steps == k, UNCHANGED)
+            refuses(partial(env.step, action, gripper), SimError, BAD_COMMAND)
+        expect(env.n_steps == k, UNCHANGED)
         seen.append(env.step(*command))
-    _require(_bits(seen) == before, UNCHANGED)
+    expect(_bits(seen) == before, UNCHANGED)
 
 
 # --- task ---------------------------------------------------------------------------------------
@@ -243,13 +244,13 @@ def _check_starts(task: Task, names: Sequence[str]) -> None:
         start = task.start(name)
         kept = start.state.tobytes()
         again = task.start(name)
-        _require(start.name == name and again.state.tobytes() == kept, STARTS)
+        expect(start.name == name and again.state.tobytes() == kept, STARTS)
         start.state[:] = np.nan
-        _require(task.start(name).state.tobytes() == kept, OWN_STATE)
+        expect(task.start(name).state.tobytes() == kept, OWN_STATE)
         states.append(kept)
-    _require(len(set(states)) == len(set(names)), DIFFER)
+    expect(len(set(states)) == len(set(names)), DIFFER)
     for wrong in ("nonsense", official_name(task.n_official_starts)):
-        _refuses(partial(task.start, wrong), ConfigError, NO_START)
+        refuses(partial(task.start, wrong), ConfigError, NO_START)
 
 
 def _check_expert(
@@ -257,7 +258,7 @@ def _check_expert(
 ) -> None:
     start = task.start(name)
     env.reset(start.state)
-    _require(not env.is_success(), UNSOLVED)
+    expect(not env.is_success(), UNSOLVED)
     steps: list[Step] = []
     commands: list[Command] = []
 
@@ -268,30 +269,30 @@ def _check_expert(
     result = run_episode(env, task, start, task.expert(seed), limits, on_step=keep)
     for action, gripper in commands:
         is_action = np.shape(action) == (3,) and bool(np.isfinite(action).all())
-        _require(is_action and bool(np.abs(action).max() <= 1.0), COMMANDS)
-        _require(gripper in (GRIPPER_OPEN, GRIPPER_HOLD, GRIPPER_CLOSE), COMMANDS)
-    _require(result.is_success, f"{SOLVES} ({name}, expert {seed}: {result.stage})")
-    _require(all(result.phase_steps), f"{VISITS} ({name}: {result.phase_steps})")
+        expect(is_action and bool(np.abs(action).max() <= 1.0), COMMANDS)
+        expect(gripper in (GRIPPER_OPEN, GRIPPER_HOLD, GRIPPER_CLOSE), COMMANDS)
+    expect(result.is_success, f"{SOLVES} ({name}, expert {seed}: {result.stage})")
+    expect(all(result.phase_steps), f"{VISITS} ({name}: {result.phase_steps})")
     again, another = ([_answers(task, s, steps)] for s in (seed, seed + 1))
-    _require(again == [_bits_of(commands)] != another, SEEDED)
+    expect(again == [_bits_of(commands)] != another, SEEDED)
     _check_tracker(task, steps)
 
 
 def _check_tracker(task: Task, steps: Sequence[Step]) -> None:
     observations = [step.observation for step in steps]
     seen = _track(task.tracker(observations[0]), observations)
-    _require(seen[0][0] == 0, ADVANCES)
+    expect(seen[0][0] == 0, ADVANCES)
     for (before, old), (after, new) in pairwise(seen):
-        _require(after in (before, before + 1), ADVANCES)
-        _require(after > before or new >= old, PROGRESS)
-    _require(all(0.0 <= progress <= 1.0 for _, progress in seen), PROGRESS)
+        expect(after in (before, before + 1), ADVANCES)
+        expect(after > before or new >= old, PROGRESS)
+    expect(all(0.0 <= progress <= 1.0 for _, progress in seen), PROGRESS)
     far = {name: (at + 9.0, quat) for name, (at, quat) in observations[0].objects.items()}
     blind = [observations[0], *(replace(o, objects=far) for o in observations[1:])]
-    _require(_track(task.tracker(observations[0]), blind) == seen, BLIND)
+    expect(_track(task.tracker(observations[0]), blind) == seen, BLIND)
     one, other = task.tracker(observations[0]), task.tracker(observations[0])
     for observation in observations[:_N_STEPS]:
         one.update(observation)
-    _require(_track(other, observations) == seen, ALONE)
+    expect(_track(other, observations) == seen, ALONE)
 
 
 # --- what the checks share ----------------------------------------------------------------------
@@ -338,18 +339,3 @@ def _is_array(value: object, shape: tuple[int, ...]) -> bool:
         and value.shape == shape
         and bool(np.isfinite(value).all())
     )
-
-
-def _refuses(attempt: Callable[[], object], kind: type[CurationError], rule: str) -> None:
-    try:
-        attempt()
-    except kind:
-        return
-    except Exception as err:
-        raise AssertionError(f"{rule} ({type(err).__name__}: {err})") from err
-    raise AssertionError(rule)
-
-
-def _require(holds: bool, rule: str) -> None:
-    if not holds:
-        raise AssertionError(rule)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import Generic, TypeVar
 
+from curation_ros.core.errors import CurationError
+
 Case = TypeVar("Case")
 
 
@@ -47,10 +49,30 @@ def expect(condition: object, found: str) -> None:
 
     Args:
         condition: expected to be true.
-        found: what was found instead.
+        found: what was found instead, or the rule that is broken.
 
     Raises:
         AssertionError: with `found`.
     """
     if not condition:
         raise AssertionError(found)
+
+
+def refuses(attempt: Callable[[], object], kind: type[CurationError], rule: str) -> None:
+    """An assertion that bad input is refused with an error of the right kind.
+
+    Args:
+        attempt: gives the bad input.
+        kind: of the error that is expected.
+        rule: the sentence that demands it.
+
+    Raises:
+        AssertionError: with the rule, and with what was raised instead.
+    """
+    try:
+        attempt()
+    except kind:
+        return
+    except Exception as err:
+        raise AssertionError(f"{rule} ({type(err).__name__}: {err})") from err
+    raise AssertionError(rule)
